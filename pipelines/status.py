@@ -22,7 +22,7 @@ from .run.names import STAGES
 from .run.records import StageRecord, differing_settings, load_records, load_source
 from .run.running import Running, load_running
 from .run.settings_file import load_settings
-from .structure.window_size import window_size, windows_of
+from .sfm.window_size import window_size, windows_of
 from .system.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size
 from .system.wording import quoted
 

@@ -19,7 +19,7 @@ FORBIDDEN = {
 
 FLOORS = (
     {"config", "types"}, {"geometry", "read_config"}, {"providers", "system"}, {"compute"},
-    {"correspondence", "render", "networks"}, {"depth"}, {"doctor", "run", "structure"}, {"engine", "source"},
+    {"render", "networks"}, {"depth"}, {"doctor", "run", "sfm"}, {"engine", "source"},
     {"labels", "masks"}, {"frames", "proxy"}, {"mapping", "tracking"}, {"global_ba", "outcome", "status"}, {"scene"},
     {"export"}, {"reconstruct", "viewer"}, {"batch", "evaluation"}, {"demo", "render_run"},
 )  # fmt: skip

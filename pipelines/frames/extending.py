@@ -8,7 +8,7 @@ import numpy as np
 
 from ..geometry.sparse_model import SparseModel
 from ..run.before import Before
-from ..structure.given import agreement
+from ..sfm.given import agreement
 from ..types import Frame
 
 

@@ -10,9 +10,9 @@ import pycolmap
 
 from ...formats.reconstruction import pose_of
 from ..engine.stages import StageContext
-from ..structure.candidates import GIVEN, GIVEN_ALONE
-from ..structure.given import agreement
-from ..structure.sfm import Structure
+from ..sfm.candidates import GIVEN, GIVEN_ALONE
+from ..sfm.driver import Structure
+from ..sfm.given import agreement
 from ..system.wording import stretches
 from ..types import GivenPoses
 

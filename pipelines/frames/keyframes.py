@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correspondence.flow import corners, follow
+from ..sfm.flow import corners, follow
 from ..source.sharpness import reduce_image
 
 _TRACKED_SIDE = 480

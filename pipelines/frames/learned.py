@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from ...formats.digest import file_sha256
 from ...formats.errors import InputError
 from ..config import FramesConfig
-from ..correspondence.features import extract_features, to_grey
 from ..networks.registry import Model, ModelStore
 from ..networks.runtime import Runtime, open_runtime
+from ..sfm.features import extract_features, to_grey
 from ..types import Features
 
 EXTRACTOR, MATCHER = "aliked-n16rot", "aliked-lightglue"

@@ -16,9 +16,9 @@ from ..masks.files import MaskFiles, open_masks, reduce_mask
 from ..masks.people import PeopleCards, PeopleFinder, people_cards
 from ..networks.registry import ModelStore
 from ..run.files import LEFT_OUT
+from ..sfm.lens import Lens
 from ..source.faces import Faces
 from ..source.opening import Source, open_source
-from ..structure.lens import Lens
 from ..system.progress import Progress
 from ..types import Frame, any_of
 

@@ -9,14 +9,14 @@ from dataclasses import replace
 import pycolmap
 
 from ...formats.errors import InputError
-from ..correspondence.matching import VerifiedPair, match_pair
-from ..correspondence.snapshots import Snapshots, features_name
 from ..engine.stages import StageContext
-from ..structure.candidates import GIVEN_ALONE
-from ..structure.consistency import unexplained
-from ..structure.focal import calibrated
-from ..structure.lens import FOCAL_GUESS, unknown_camera
-from ..structure.sfm import Structure, StructureFromMotion, when_asked
+from ..sfm.candidates import GIVEN_ALONE
+from ..sfm.consistency import unexplained
+from ..sfm.driver import Structure, StructureFromMotion, when_asked
+from ..sfm.focal import calibrated
+from ..sfm.lens import FOCAL_GUESS, unknown_camera
+from ..sfm.matching import VerifiedPair, match_pair
+from ..sfm.snapshots import Snapshots, features_name
 from ..system.parallel import parallel_map
 
 _PAIRS = 60

@@ -18,7 +18,6 @@ from ...formats.images import hint_at_inner_folder, read_rgb, write_rgb
 from ...formats.jsonfile import read_json, write_json
 from ...formats.video import VideoFrame
 from ..config import Config
-from ..correspondence.bridges import Picture
 from ..engine.stages import Stage, StageContext
 from ..engine.tasks import in_chunks
 from ..geometry.rig import Rig, rig_of
@@ -35,17 +34,18 @@ from ..run.files import (
 )
 from ..run.folder import RunFolder
 from ..run.records import load_records
+from ..sfm.backbone import to_sparse_model
+from ..sfm.bridges import Picture
+from ..sfm.calibration import intrinsics_inputs, read_intrinsics
+from ..sfm.driver import Structure
+from ..sfm.lens import Lens, distortion_of, make_lens
+from ..sfm.parallax import require_motion
+from ..sfm.rolling import read_readout
+from ..sfm.window_size import window_size, windows_of
 from ..source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
 from ..source.known_poses import check_poses, given_poses, pose_inputs
 from ..source.opening import FolderSource, Source, Warn, open_source
 from ..source.sharpness import reduce_image
-from ..structure.backbone import to_sparse_model
-from ..structure.calibration import intrinsics_inputs, read_intrinsics
-from ..structure.lens import Lens, distortion_of, make_lens
-from ..structure.parallax import require_motion
-from ..structure.rolling import read_readout
-from ..structure.sfm import Structure
-from ..structure.window_size import window_size, windows_of
 from ..system.parallel import parallel_map
 from ..types import Calibration, Frame, GivenPoses
 from .extending import in_world_of

@@ -11,23 +11,23 @@ import pycolmap
 
 from ...formats.datasets.camera import Camera
 from ...formats.images import read_rgb
-from ..correspondence.bridges import Picture
-from ..correspondence.features import to_grey
-from ..correspondence.matching import match_features
-from ..correspondence.snapshots import Snapshots
 from ..engine.stages import StageContext
 from ..engine.tasks import Chunk
 from ..geometry.rig import Rig, rig_of
 from ..run.before import before_of
+from ..sfm.bridges import Picture
+from ..sfm.calibration import read_intrinsics
+from ..sfm.driver import Divide, StructureFromMotion, when_asked
+from ..sfm.features import to_grey
+from ..sfm.lens import FOCAL_GUESS, calibrated_camera, to_pycolmap, unknown_camera
+from ..sfm.matching import match_features
+from ..sfm.snapshots import Snapshots
+from ..sfm.window_size import window_size
 from ..source.faces import Faces, find_faces
 from ..source.known_poses import given_poses
 from ..source.opening import FolderSource, VideoSource, open_source
 from ..source.recording import RecordingSource
 from ..source.sharpness import reduced_size
-from ..structure.calibration import read_intrinsics
-from ..structure.lens import FOCAL_GUESS, calibrated_camera, to_pycolmap, unknown_camera
-from ..structure.sfm import Divide, StructureFromMotion, when_asked
-from ..structure.window_size import window_size
 from ..system.progress import Progress
 from ..types import Features, Frame, GivenPoses
 from .learned import open_learned, picture_features

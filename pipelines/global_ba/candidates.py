@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from ..config import GlobalBaConfig
-from ..correspondence.retrieval import GlobalDescriptors, far_apart, loop_pairs
 from ..geometry.sparse_model import SparseModel
 from ..proxy.maps import mean_iou
+from ..sfm.retrieval import GlobalDescriptors, far_apart, loop_pairs
 from ..types import VOID
 
 Array = NDArray[np.float64]

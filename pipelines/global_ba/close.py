@@ -12,7 +12,7 @@ from scipy.sparse.linalg import splu
 
 from ..config import TrackingConfig
 from ..geometry import se3
-from ..structure.bundle import reprojection_errors
+from ..sfm.bundle import reprojection_errors
 from ..tracking.adjust import LoadProxy, Report, adjust_state
 from ..tracking.state import Sightings, TrackState
 from ..types import Intrinsics

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correspondence.matching import match_descriptors
 from ..geometry import se3
 from ..geometry.camera import unproject
+from ..sfm.matching import match_descriptors
 from ..tracking.pnp import FramePose, solve_pose
 from ..tracking.state import Sightings
 from ..types import Features, Intrinsics, LoopEdge

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.atomic import copy_file
-from ..correspondence.retrieval import GlobalDescriptors, compute_global_descriptors, unit
 from ..depth.align import sample_proxy
 from ..engine.stages import Stage, StageContext
 from ..geometry import se3
@@ -32,7 +31,8 @@ from ..run.files import (
     TRAJECTORY,
 )
 from ..run.folder import RunFolder
-from ..structure.bundle import reprojection_errors
+from ..sfm.bundle import reprojection_errors
+from ..sfm.retrieval import GlobalDescriptors, compute_global_descriptors, unit
 from ..system.lru_sequence import LruSequence
 from ..system.values import load_value, save_value
 from ..tracking.adjust import align_depths, without_dependent_depth

@@ -15,7 +15,7 @@ from ..geometry.posed_depth import overlaps
 from ..render.gaussian_map import GaussianMap, decided_channels
 from ..run.before import Before
 from ..run.files import FRAMES
-from ..structure.given import agreement
+from ..sfm.given import agreement
 from ..system.progress import Progress
 from ..types import Trajectory
 from .move_map import move_map, rows_of

@@ -15,8 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError
-from ..correspondence.features import to_grey
-from ..correspondence.flow import follow
 from ..depth.scale import DepthScale
 from ..engine.stages import StageContext
 from ..geometry.camera import unproject
@@ -24,8 +22,10 @@ from ..labels.segments import SegmentLabels
 from ..providers import DepthEstimate, DepthProvider, Sequence, resize_area
 from ..run.files import BACKBONE, GIVEN_POSES
 from ..run.folder import RunFolder
+from ..sfm.features import to_grey
+from ..sfm.flow import follow
+from ..sfm.given import agreement
 from ..source.opening import Source, VideoSource, open_source
-from ..structure.given import agreement
 from ..types import Frame, Intrinsics
 
 Array = NDArray[np.float64]

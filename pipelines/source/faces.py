@@ -18,8 +18,8 @@ from ...formats.errors import InputError
 from ...formats.spherical import PART, WHOLE, image_sphere, video_sphere
 from ..config import FramesConfig
 from ..geometry.rig import CUBE, LEVEL
-from ..structure.calibration import read_intrinsics
-from ..structure.lens import make_lens, to_pycolmap
+from ..sfm.calibration import read_intrinsics
+from ..sfm.lens import make_lens, to_pycolmap
 from ..types import Intrinsics
 from .opening import FolderSource, VideoSource
 from .recording import RecordingSource

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.datasets.camera import Camera
-from ..structure.lens import make_lens, to_pycolmap
+from ..sfm.lens import make_lens, to_pycolmap
 from ..types import Calibration
 
 

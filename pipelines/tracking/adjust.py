@@ -16,8 +16,8 @@ from ..depth.fields import DepthFields
 from ..geometry import se3
 from ..geometry.camera import project
 from ..geometry.sparse_model import SparseModel
-from ..structure.bundle import Bundle, adjust_bundle, adjust_pose
-from ..structure.rolling import rectified_bundle, rectified_pixels, velocities
+from ..sfm.bundle import Bundle, adjust_bundle, adjust_pose
+from ..sfm.rolling import rectified_bundle, rectified_pixels, velocities
 from ..types import Intrinsics, ProxyMaps, rows_by
 from .state import Sightings, TrackState, sync_rig_poses
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correspondence.flow import FLOW_SD, corners, follow
 from ..depth.align import sample_proxy, scale_at_points
 from ..geometry import se3
 from ..geometry.camera import project, unproject
+from ..sfm.flow import FLOW_SD, corners, follow
 from ..types import Intrinsics
 from .pictures import Pictures
 from .pnp import MIN_INLIERS, POSE_ERROR

@@ -21,11 +21,11 @@ from ..run.files import CALIBRATION, SPARSE
 from ..run.folder import RunFolder
 from ..run.names import EXTENSION, SOURCE_LIST, STAGES
 from ..run.records import Manifest, Source, load_records, load_source, write_manifest
+from ..sfm.calibration import read_intrinsics
+from ..sfm.lens import Lens, calibrated_camera, make_lens, to_pycolmap
 from ..source.opening import VideoSource, open_source, source_digest, video_files
 from ..source.recording import RecordingSource
 from ..source.sharpness import reduce_image
-from ..structure.calibration import read_intrinsics
-from ..structure.lens import Lens, calibrated_camera, make_lens, to_pycolmap
 from ..system.progress import Progress
 from ..system.wording import quoted
 from ..types import Features

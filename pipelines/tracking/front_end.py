@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correspondence.flow import FLOW_SD, follow
 from ..geometry.camera import project
+from ..sfm.flow import FLOW_SD, follow
 from .extend import promote, start_segment
 from .pictures import Pictures
 from .pnp import MIN_INLIERS, FramePose, predict_pose, solve_pose

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..config import FramesConfig
-from ..correspondence.features import to_grey
-from ..correspondence.retrieval import describe
 from ..frames.learned import open_learned, picture_features
 from ..run.files import CALIBRATION, FEATURES, FRAMES, VOCABULARY
 from ..run.folder import RunFolder
-from ..structure.rolling import Shutter
+from ..sfm.features import to_grey
+from ..sfm.retrieval import describe
+from ..sfm.rolling import Shutter
 from ..system.lru_sequence import LruSequence
 from ..types import Features, ProxyMaps
 

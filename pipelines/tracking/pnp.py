@@ -10,7 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from ..geometry import se3
-from ..structure.bundle import adjust_pose, reprojection_errors
+from ..sfm.bundle import adjust_pose, reprojection_errors
 from ..types import Intrinsics
 
 MAX_GAP = 3

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correspondence.matching import match_descriptors
 from ..geometry import se3
+from ..sfm.matching import match_descriptors
 from .pictures import Pictures
 from .pnp import MIN_INLIERS, FramePose, solve_pose
 from .state import NO_SIGHTINGS, Sightings, TrackState

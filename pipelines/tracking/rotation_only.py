@@ -7,10 +7,10 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correspondence.flow import corners, follow
-from ..correspondence.matching import match_descriptors
 from ..geometry.camera import project, unproject
 from ..geometry.se3 import best_rotation
+from ..sfm.flow import corners, follow
+from ..sfm.matching import match_descriptors
 from ..types import Intrinsics
 from .pictures import Pictures
 from .pnp import MAX_GAP, MIN_INLIERS

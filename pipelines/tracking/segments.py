@@ -14,7 +14,7 @@ from ..engine.stages import StageContext
 from ..geometry import se3
 from ..geometry.se3 import Similarity
 from ..run.files import GIVEN_POSES
-from ..structure.given import agreement
+from ..sfm.given import agreement
 from ..system.wording import stretches
 from ..types import GivenPoses
 from .pictures import Pictures

@@ -17,7 +17,7 @@ from ..run.files import (
     SPARSE,
     TRAJECTORY,
 )
-from ..structure.rolling import Shutter
+from ..sfm.rolling import Shutter
 from ..system.memory import release_free_memory
 from ..system.stopping import is_asked
 from ..system.values import load_value, save_value

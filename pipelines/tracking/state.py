@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from ..geometry import se3
 from ..geometry.rig import ONE_CAMERA, Rig
 from ..geometry.sparse_model import SparseModel
-from ..structure.rolling import Shutter, velocities
+from ..sfm.rolling import Shutter, velocities
 
 Array = NDArray[np.float64]
 

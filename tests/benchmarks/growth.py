@@ -28,7 +28,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import GlobalBaConfig
-from msgs_slam.pipelines.correspondence.retrieval import GlobalDescriptors, far_apart, loop_pairs, unit
 from msgs_slam.pipelines.depth.align import fit_fields
 from msgs_slam.pipelines.depth.see_through import contradicted
 from msgs_slam.pipelines.depth.stereo.neighbours import choose_neighbours, depth_range
@@ -37,7 +36,8 @@ from msgs_slam.pipelines.geometry.camera import pixel_centers, project
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth, neighbours
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.candidates import loop_candidates, summarise_labels
-from msgs_slam.pipelines.structure.bundle import adjust_bundle
+from msgs_slam.pipelines.sfm.bundle import adjust_bundle
+from msgs_slam.pipelines.sfm.retrieval import GlobalDescriptors, far_apart, loop_pairs, unit
 from msgs_slam.pipelines.tracking.adjust import make_bundle
 from msgs_slam.pipelines.tracking.state import TrackState
 from msgs_slam.pipelines.types import Intrinsics

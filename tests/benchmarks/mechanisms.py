@@ -29,7 +29,6 @@ from poses import compare, recordings
 from tracking import Case, in_process, original_names, prepare
 
 from msgs_slam.formats.reconstruction import pose_of
-from msgs_slam.pipelines.correspondence.snapshots import Snapshots
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames import stage as frames_stage
 from msgs_slam.pipelines.frames import tasks
@@ -37,8 +36,10 @@ from msgs_slam.pipelines.frames.picking import pick_frames
 from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.sfm import candidates
+from msgs_slam.pipelines.sfm import driver as sfm
+from msgs_slam.pipelines.sfm.snapshots import Snapshots
 from msgs_slam.pipelines.source.opening import open_source
-from msgs_slam.pipelines.structure import candidates, sfm
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 SMALL = ("replica", "kitchen", "whiteroom", "fr1_rpy", "house_portrait", "corridor", "office_loop", "bedroom")
@@ -147,7 +148,7 @@ def measured(name: str, form: str, off: str, work: Path) -> dict[str, Any]:
 
 
 def _words(features: Any) -> Any:
-    from msgs_slam.pipelines.correspondence.retrieval import learn_vocabulary
+    from msgs_slam.pipelines.sfm.retrieval import learn_vocabulary
 
     return learn_vocabulary(features, 0)
 

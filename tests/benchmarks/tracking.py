@@ -244,7 +244,7 @@ def run_stages_timed(
 @contextmanager
 def adjustment_timed() -> Iterator[list[float]]:
     """CPU seconds of every adjustment of all keyframes together while this is open."""
-    from msgs_slam.pipelines.structure import candidates
+    from msgs_slam.pipelines.sfm import candidates
     from msgs_slam.pipelines.tracking import stage
 
     spent: list[float] = []

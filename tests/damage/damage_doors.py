@@ -67,8 +67,8 @@ from msgs_slam.pipelines.networks.network_pass import ResultCache
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.networks.words import load_linear_head, load_word_head, open_tokenizer, with_words
+from msgs_slam.pipelines.sfm.calibration import read_intrinsics
 from msgs_slam.pipelines.source.opening import open_source
-from msgs_slam.pipelines.structure.calibration import read_intrinsics
 from msgs_slam.pipelines.viewer.scene import load_scenes
 from tests.colmap_models import posed_images
 from tests.matrices import write_matrices

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from msgs_slam.pipelines.correspondence.features import extract_features, to_grey
-from msgs_slam.pipelines.correspondence.retrieval import learn_vocabulary
 from msgs_slam.pipelines.run.files import FEATURES, MATCHED_PAIRS, VOCABULARY
+from msgs_slam.pipelines.sfm.features import extract_features, to_grey
+from msgs_slam.pipelines.sfm.retrieval import learn_vocabulary
 
 
 def keep_correspondences(folder: Path, pictures: Mapping[int, np.ndarray]) -> None:

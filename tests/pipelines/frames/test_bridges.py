@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.correspondence.bridges import LEAST, Picture, bridged, weakly_connected
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair, match_features
-from msgs_slam.pipelines.correspondence.retrieval import describe, learn_vocabulary
+from msgs_slam.pipelines.sfm.bridges import LEAST, Picture, bridged, weakly_connected
+from msgs_slam.pipelines.sfm.matching import VerifiedPair, match_features
+from msgs_slam.pipelines.sfm.retrieval import describe, learn_vocabulary
 from msgs_slam.pipelines.types import Features
 
 STEP = np.array([9.0, -4.0])

@@ -16,9 +16,9 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config, FramesConfig
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import STAGE, run
+from msgs_slam.pipelines.sfm.calibration import read_intrinsics
+from msgs_slam.pipelines.sfm.lens import distortion_of, make_lens, set_lens, to_pycolmap, unknown_camera
 from msgs_slam.pipelines.source.opening import FolderSource
-from msgs_slam.pipelines.structure.calibration import read_intrinsics
-from msgs_slam.pipelines.structure.lens import distortion_of, make_lens, set_lens, to_pycolmap, unknown_camera
 from tests.pipelines.frames.conftest import Walk
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.pipelines.structure import focal as focal_module
-from msgs_slam.pipelines.structure.focal import _errors, _rotation, calibrated, two_view_lens
-from msgs_slam.pipelines.structure.lens import to_pycolmap, unknown_camera
+from msgs_slam.pipelines.sfm import focal as focal_module
+from msgs_slam.pipelines.sfm.focal import _errors, _rotation, calibrated, two_view_lens
+from msgs_slam.pipelines.sfm.lens import to_pycolmap, unknown_camera
 from tests.pipelines.frames.made_views import structure_of, walk_round
 
 SIZE = (640, 480)

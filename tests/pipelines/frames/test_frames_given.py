@@ -15,12 +15,12 @@ from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.run.files import GIVEN_POSES
+from msgs_slam.pipelines.sfm.candidates import GIVEN, _worth
+from msgs_slam.pipelines.sfm.consistency import ModelReport
+from msgs_slam.pipelines.sfm.given import agreement, posed_model
+from msgs_slam.pipelines.sfm.lens import to_pycolmap, unknown_camera
 from msgs_slam.pipelines.source.known_poses import given_poses
 from msgs_slam.pipelines.source.opening import open_source
-from msgs_slam.pipelines.structure.candidates import GIVEN, _worth
-from msgs_slam.pipelines.structure.consistency import ModelReport
-from msgs_slam.pipelines.structure.given import agreement, posed_model
-from msgs_slam.pipelines.structure.lens import to_pycolmap, unknown_camera
 from msgs_slam.pipelines.types import Frame, GivenPoses
 from tests.pipelines.frames.made_views import structure_of, walk_round
 

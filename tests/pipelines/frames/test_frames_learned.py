@@ -17,7 +17,6 @@ from onnx import TensorProto, helper, numpy_helper
 import msgs_slam.pipelines.frames.learned as learned
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import FramesConfig
-from msgs_slam.pipelines.correspondence.matching import match_descriptors
 from msgs_slam.pipelines.frames.learned import (
     EXTRACTOR,
     MATCHER,
@@ -30,6 +29,7 @@ from msgs_slam.pipelines.geometry.camera import project, unproject
 from msgs_slam.pipelines.masks.people import people_cards
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.read_config import load_config
+from msgs_slam.pipelines.sfm.matching import match_descriptors
 from msgs_slam.pipelines.types import Features
 from tests.world import ClipOptions, make_world, render_frame
 

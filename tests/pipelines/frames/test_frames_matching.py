@@ -11,10 +11,14 @@ import numpy as np
 import pycolmap
 import pytest
 
-from msgs_slam.pipelines.correspondence import matching, retrieval
-from msgs_slam.pipelines.correspondence.features import extract_features
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair, match_descriptors, verify_matches, write_database
-from msgs_slam.pipelines.correspondence.retrieval import (
+from msgs_slam.pipelines.frames.keyframes import choose_keyframes
+from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
+from msgs_slam.pipelines.sfm import matching, retrieval
+from msgs_slam.pipelines.sfm.consistency import epipolar_error, judge, without_misplaced
+from msgs_slam.pipelines.sfm.features import extract_features
+from msgs_slam.pipelines.sfm.matching import VerifiedPair, match_descriptors, verify_matches, write_database
+from msgs_slam.pipelines.sfm.parallax import rotation_residual, why_no_structure
+from msgs_slam.pipelines.sfm.retrieval import (
     GlobalDescriptors,
     describe,
     far_apart,
@@ -22,11 +26,7 @@ from msgs_slam.pipelines.correspondence.retrieval import (
     loop_pairs,
     sequential_pairs,
 )
-from msgs_slam.pipelines.correspondence.snapshots import Snapshots
-from msgs_slam.pipelines.frames.keyframes import choose_keyframes
-from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
-from msgs_slam.pipelines.structure.consistency import epipolar_error, judge, without_misplaced
-from msgs_slam.pipelines.structure.parallax import rotation_residual, why_no_structure
+from msgs_slam.pipelines.sfm.snapshots import Snapshots
 from msgs_slam.pipelines.types import Features
 from tests.pipelines.frames.conftest import FOCAL, HEIGHT, WIDTH, render, sideways, turn
 

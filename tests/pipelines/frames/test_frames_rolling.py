@@ -14,16 +14,9 @@ from msgs_slam.pipelines.config import TrackingConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import align_points
-from msgs_slam.pipelines.structure.bundle import Bundle, adjust_bundle
-from msgs_slam.pipelines.structure.lens import unknown_camera
-from msgs_slam.pipelines.structure.rolling import (
-    LEAST_GAIN,
-    Shutter,
-    adjust_rolling,
-    estimate,
-    read_readout,
-    velocities,
-)
+from msgs_slam.pipelines.sfm.bundle import Bundle, adjust_bundle
+from msgs_slam.pipelines.sfm.lens import unknown_camera
+from msgs_slam.pipelines.sfm.rolling import LEAST_GAIN, Shutter, adjust_rolling, estimate, read_readout, velocities
 from msgs_slam.pipelines.tracking.adjust import adjust_state
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics

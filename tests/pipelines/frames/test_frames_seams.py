@@ -12,9 +12,10 @@ import pytest
 
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.findings import warn_of_structure
-from msgs_slam.pipelines.structure.adjust import adjust
-from msgs_slam.pipelines.structure.consistency import ModelReport, judge
-from msgs_slam.pipelines.structure.seams import (
+from msgs_slam.pipelines.sfm.adjust import adjust
+from msgs_slam.pipelines.sfm.consistency import ModelReport, judge
+from msgs_slam.pipelines.sfm.driver import Structure
+from msgs_slam.pipelines.sfm.seams import (
     PairCheck,
     Seam,
     cut,
@@ -25,7 +26,6 @@ from msgs_slam.pipelines.structure.seams import (
     tracks_of,
     worst_contradictions,
 )
-from msgs_slam.pipelines.structure.sfm import Structure
 from msgs_slam.pipelines.types import Vocabulary
 
 COUNT, REACH = 40, 4

@@ -16,7 +16,6 @@ import pytest
 from msgs_slam.formats.errors import DiskFullError, InputError
 from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.formats.jsonfile import read_json
-from msgs_slam.pipelines.correspondence.snapshots import Snapshots
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.geometry.se3 import align_points
@@ -24,9 +23,10 @@ from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, SPARSE
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.layouts import dataclass_from_json
+from msgs_slam.pipelines.sfm import driver as sfm
+from msgs_slam.pipelines.sfm.snapshots import Snapshots
+from msgs_slam.pipelines.sfm.window_size import windows_of
 from msgs_slam.pipelines.source.opening import source_digest
-from msgs_slam.pipelines.structure import sfm
-from msgs_slam.pipelines.structure.window_size import windows_of
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration
 from tests.pipelines.frames.conftest import QUICK, WALK_FRAMES, Walk, render, sideways, turn, write_walk

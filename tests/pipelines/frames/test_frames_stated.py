@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.pipelines.structure.lens import to_pycolmap
+from msgs_slam.pipelines.sfm.lens import to_pycolmap
 from tests.pipelines.frames.made_views import structure_of, walk_round
 
 KINECT = Camera(640, 480, 517.3, 516.5, 319.1, 255.8, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))

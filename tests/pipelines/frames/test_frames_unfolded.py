@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import FramesConfig
-from msgs_slam.pipelines.correspondence.bridges import Picture
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair, verify_matches
-from msgs_slam.pipelines.correspondence.snapshots import Snapshots
 from msgs_slam.pipelines.geometry.se3 import align_points
-from msgs_slam.pipelines.structure.candidates import Views
-from msgs_slam.pipelines.structure.lens import unknown_camera
-from msgs_slam.pipelines.structure.sfm import StructureFromMotion
+from msgs_slam.pipelines.sfm.bridges import Picture
+from msgs_slam.pipelines.sfm.candidates import Views
+from msgs_slam.pipelines.sfm.driver import StructureFromMotion
+from msgs_slam.pipelines.sfm.lens import unknown_camera
+from msgs_slam.pipelines.sfm.matching import VerifiedPair, verify_matches
+from msgs_slam.pipelines.sfm.snapshots import Snapshots
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Features

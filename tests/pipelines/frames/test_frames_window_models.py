@@ -11,13 +11,13 @@ import pycolmap
 import pytest
 
 from msgs_slam.pipelines.config import FramesConfig
-from msgs_slam.pipelines.correspondence.snapshots import Snapshots
-from msgs_slam.pipelines.structure.bundle import Bundle
-from msgs_slam.pipelines.structure.candidates import Adjusted, Views
-from msgs_slam.pipelines.structure.rolling import NO_READOUT, Readout
-from msgs_slam.pipelines.structure.sfm import StructureFromMotion
-from msgs_slam.pipelines.structure.window_size import windows_of
-from msgs_slam.pipelines.structure.windows import WindowModels, found_readout
+from msgs_slam.pipelines.sfm.bundle import Bundle
+from msgs_slam.pipelines.sfm.candidates import Adjusted, Views
+from msgs_slam.pipelines.sfm.driver import StructureFromMotion
+from msgs_slam.pipelines.sfm.rolling import NO_READOUT, Readout
+from msgs_slam.pipelines.sfm.snapshots import Snapshots
+from msgs_slam.pipelines.sfm.window_size import windows_of
+from msgs_slam.pipelines.sfm.windows import WindowModels, found_readout
 from msgs_slam.pipelines.system.lru_sequence import LruSequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.pipelines.frames.test_frames_rolling import COUNT, READOUT, TIMES, as_model, off_by, poses_of, seen_by

@@ -10,7 +10,6 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.correspondence.matching import VerifiedPair
 from msgs_slam.pipelines.frames.stage import STAGE
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
@@ -19,13 +18,14 @@ from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import CALIBRATION
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import Manifest, Source, StageRecord, checksums, write_manifest
-from msgs_slam.pipelines.structure.adjust import adjust, reprojection_errors
-from msgs_slam.pipelines.structure.consistency import judge
-from msgs_slam.pipelines.structure.lens import unknown_camera
-from msgs_slam.pipelines.structure.rolling import NO_READOUT
-from msgs_slam.pipelines.structure.scale_repair import mended, resize_behind, size_ratio
-from msgs_slam.pipelines.structure.window_size import SHARED, SIZE, window_size, windows_of
-from msgs_slam.pipelines.structure.windows import WIDE, Joined, adjust_together, close_loops
+from msgs_slam.pipelines.sfm.adjust import adjust, reprojection_errors
+from msgs_slam.pipelines.sfm.consistency import judge
+from msgs_slam.pipelines.sfm.lens import unknown_camera
+from msgs_slam.pipelines.sfm.matching import VerifiedPair
+from msgs_slam.pipelines.sfm.rolling import NO_READOUT
+from msgs_slam.pipelines.sfm.scale_repair import mended, resize_behind, size_ratio
+from msgs_slam.pipelines.sfm.window_size import SHARED, SIZE, window_size, windows_of
+from msgs_slam.pipelines.sfm.windows import WIDE, Joined, adjust_together, close_loops
 from msgs_slam.pipelines.types import Calibration, Intrinsics
 from tests.world.paths import look_at
 

@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import GlobalBaConfig, TrackingConfig
-from msgs_slam.pipelines.correspondence.retrieval import GlobalDescriptors, describe, learn_vocabulary
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import align_points
@@ -20,6 +19,7 @@ from msgs_slam.pipelines.global_ba import loops
 from msgs_slam.pipelines.global_ba.candidates import loop_candidates, shared_points, summarise_labels
 from msgs_slam.pipelines.global_ba.close import close_loops, reprojection_error
 from msgs_slam.pipelines.global_ba.loops import FoundLoops, KeyframeView, find_loops, make_view, verify_loop
+from msgs_slam.pipelines.sfm.retrieval import GlobalDescriptors, describe, learn_vocabulary
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.state import TrackState
 from msgs_slam.pipelines.types import Features, Intrinsics

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from msgs_slam.pipelines.correspondence.retrieval import describe, learn_vocabulary
 from msgs_slam.pipelines.global_ba.candidates import richness, similarity, structure_similarity, summarise_labels
+from msgs_slam.pipelines.sfm.retrieval import describe, learn_vocabulary
 from msgs_slam.pipelines.types import Features
 
 

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_grey_png, write_rgb
 from msgs_slam.pipelines.config import MappingConfig
-from msgs_slam.pipelines.correspondence.features import extract_features
-from msgs_slam.pipelines.correspondence.flow import corners
 from msgs_slam.pipelines.depth.stereo.sweep import sweep_cost
 from msgs_slam.pipelines.depth.stereo.volume import Bands
 from msgs_slam.pipelines.frames.keyframes import choose_keyframes
@@ -27,6 +25,8 @@ from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.providers import DepthEstimate, LabelEstimate
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.render.api import Rendering
+from msgs_slam.pipelines.sfm.features import extract_features
+from msgs_slam.pipelines.sfm.flow import corners
 from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame, Intrinsics

@@ -18,8 +18,8 @@ def sources(stage: str) -> set[str]:
 
 def test_sources_are_what_the_stage_imports_and_nothing_else() -> None:
     assert {"pipelines/render/cpu_forward.py", "pipelines/render/__init__.py"} <= sources("mapping")
-    assert {"pipelines/structure/sfm.py", "formats/video.py", "pipelines/run/folder.py"} <= sources("frames")
-    assert "pipelines/structure/bundle_kernels.py" in sources("global_ba")
+    assert {"pipelines/sfm/driver.py", "formats/video.py", "pipelines/run/folder.py"} <= sources("frames")
+    assert "pipelines/sfm/bundle_kernels.py" in sources("global_ba")
     for stage in STAGES:
         assert not {
             s for s in sources(stage) if "evaluation" in s or "msgs_cli" in s or s.endswith("pipelines/config.py")

@@ -10,7 +10,7 @@ from msgs_slam.pipelines.config import TrackingConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import align_points
-from msgs_slam.pipelines.structure.bundle import Bundle, Problem, adjust_bundle, adjust_pose, solve_blocks
+from msgs_slam.pipelines.sfm.bundle import Bundle, Problem, adjust_bundle, adjust_pose, solve_blocks
 from msgs_slam.pipelines.tracking.adjust import adjust_state, consistent
 from msgs_slam.pipelines.tracking.pnp import colmap_camera
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
@@ -173,7 +173,7 @@ def test_outliers_hardly_matter(known_bundle: KnownBundle) -> None:
 
 def test_sparse_and_dense_solve_the_same_system(known_bundle: KnownBundle, monkeypatch: pytest.MonkeyPatch) -> None:
     dense = adjust_bundle(known_bundle.bundle, known_bundle.intrinsics, 4).bundle
-    monkeypatch.setattr("msgs_slam.pipelines.structure.bundle.DENSE_CAMERAS", 1)
+    monkeypatch.setattr("msgs_slam.pipelines.sfm.bundle.DENSE_CAMERAS", 1)
     sparse = adjust_bundle(known_bundle.bundle, known_bundle.intrinsics, 4).bundle
     assert not np.array_equal(dense.points, sparse.points)
     assert np.allclose(dense.cam_from_world, sparse.cam_from_world, atol=1e-7)
@@ -190,7 +190,7 @@ def test_same_input_same_bytes_and_any_order(known_bundle: KnownBundle) -> None:
 
 
 def test_reaches_the_minimum_of_ceres(known_bundle: KnownBundle, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("msgs_slam.pipelines.structure.bundle._LEAST_GAIN", 1e-12)
+    monkeypatch.setattr("msgs_slam.pipelines.sfm.bundle._LEAST_GAIN", 1e-12)
     bundle, intrinsics = without_depth(known_bundle.bundle), known_bundle.intrinsics
     ours = adjust_bundle(bundle, intrinsics, 100, width=1e6)
     reconstruction = to_colmap(bundle, intrinsics)

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from msgs_slam.pipelines.correspondence.features import extract_features
-from msgs_slam.pipelines.correspondence.flow import corners, follow
-from msgs_slam.pipelines.correspondence.matching import match_descriptors
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.sfm.features import extract_features
+from msgs_slam.pipelines.sfm.flow import corners, follow
+from msgs_slam.pipelines.sfm.matching import match_descriptors
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.extend import triangulate
 from msgs_slam.pipelines.tracking.pnp import interpolate_pose, predict_pose, solve_pose

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.rig import CUBE, Rig, rig_of, tie_cameras
 from msgs_slam.pipelines.geometry.se3 import align_points
-from msgs_slam.pipelines.structure.bundle import Bundle, adjust_bundle
+from msgs_slam.pipelines.sfm.bundle import Bundle, adjust_bundle
 from msgs_slam.pipelines.tracking.segments import split_segments
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState, sync_rig_poses
 from msgs_slam.pipelines.types import Intrinsics
@@ -82,7 +82,7 @@ def test_tied_blocks_are_the_system_in_the_places_steps() -> None:
 @pytest.mark.parametrize("dense", [True, False])
 def test_sides_move_together_in_the_adjustment(dense: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not dense:
-        monkeypatch.setattr("msgs_slam.pipelines.structure.bundle.DENSE_CAMERAS", 0)
+        monkeypatch.setattr("msgs_slam.pipelines.sfm.bundle.DENSE_CAMERAS", 0)
     rng = np.random.default_rng(1)
     true = _places(rng)
     bundle = _bundle(_sides(true), rng, noise=0.5)

@@ -12,12 +12,12 @@ import pytest
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.correspondence.retrieval import describe
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, DEPTH_FIELDS, FRAMES, GIVEN_POSES, SPARSE, TRAJECTORY
+from msgs_slam.pipelines.sfm.retrieval import describe
 from msgs_slam.pipelines.tracking import adjust, pictures, stage
 from msgs_slam.pipelines.tracking.stage import STAGE, stretches
 from msgs_slam.pipelines.tracking.state import TrackState

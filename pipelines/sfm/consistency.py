@@ -10,9 +10,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from ..correspondence.matching import VerifiedPair
 from .adjust import median_error, reprojection_errors, solve
 from .lens import distortion_of
+from .matching import VerifiedPair
 from .seams import (
     PairCheck,
     Seam,

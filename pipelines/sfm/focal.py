@@ -19,8 +19,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from ..correspondence.matching import MIN_INLIERS, VerifiedPair
 from ..geometry import se3
+from .matching import MIN_INLIERS, VerifiedPair
 
 Array = NDArray[np.float64]
 

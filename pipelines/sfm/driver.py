@@ -15,9 +15,20 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ...formats.jsonfile import read_json, write_json
-from ..correspondence.bridges import Picture, weakly_connected, with_bridges
-from ..correspondence.matching import VerifiedPair, match_pair
-from ..correspondence.retrieval import (
+from ..system.lru_sequence import LruSequence
+from ..system.memory import release_free_memory
+from ..system.parallel import parallel_map
+from ..system.progress import log
+from ..types import Features, Vocabulary
+from .adjust import adjust
+from .bridges import Picture, weakly_connected, with_bridges
+from .candidates import GIVEN_ALONE, Adjusted, Candidates, Views
+from .consistency import ModelReport, judge
+from .given import bare_model, set_best_focal
+from .lens import set_lens
+from .matching import VerifiedPair, match_pair
+from .parallax import require_parallax, why_no_structure
+from .retrieval import (
     GlobalDescriptors,
     compute_global_descriptors,
     far_apart,
@@ -25,20 +36,9 @@ from ..correspondence.retrieval import (
     loop_pairs,
     sequential_pairs,
 )
-from ..correspondence.snapshots import Snapshots, features_name, pairs_name
-from ..system.lru_sequence import LruSequence
-from ..system.memory import release_free_memory
-from ..system.parallel import parallel_map
-from ..system.progress import log
-from ..types import Features, Vocabulary
-from .adjust import adjust
-from .candidates import GIVEN_ALONE, Adjusted, Candidates, Views
-from .consistency import ModelReport, judge
-from .given import bare_model, set_best_focal
-from .lens import set_lens
-from .parallax import require_parallax, why_no_structure
 from .rolling import NO_READOUT, Readout, adjust_rolling, read_readout
 from .seams import cut, remove_keyframes
+from .snapshots import Snapshots, features_name, pairs_name
 from .window_size import SIZE, windows_of
 from .windows import WindowModels, adjust_joined
 

@@ -15,8 +15,6 @@ import pycolmap
 from numpy.typing import NDArray
 
 from ..config import FramesConfig
-from ..correspondence.matching import VerifiedPair, write_database
-from ..correspondence.snapshots import Snapshots
 from ..geometry.rig import ONE_CAMERA
 from ..system.lru_sequence import LruSequence
 from ..system.progress import Progress
@@ -35,8 +33,10 @@ from .focal import calibrated
 from .given import posed_model
 from .lens import FOCAL_GUESS, unknown_camera
 from .mappers import map_globally, map_incrementally
+from .matching import VerifiedPair, write_database
 from .rolling import NO_READOUT, Readout, adjust_rolling, read_readout, straight_copy
 from .scale_repair import mended
+from .snapshots import Snapshots
 from .windows import WIDE, close_loops
 
 _MIN_KEYFRAMES = 3

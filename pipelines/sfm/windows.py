@@ -15,21 +15,13 @@ import pycolmap
 from numpy.typing import NDArray
 
 from ...formats.reconstruction import pose_of, set_pose
-from ..correspondence.matching import VerifiedPair
 from ..geometry import se3
 from ..geometry.se3 import Similarity, best_rotation
 from .adjust import LOSS_SD, filter_outliers, median_error
 from .bundle import adjust_bundle
 from .given import bare_model
-from .rolling import (
-    LEAST_GAIN,
-    NO_READOUT,
-    Readout,
-    RollingModel,
-    estimate,
-    rectified_bundle,
-    velocities,
-)
+from .matching import VerifiedPair
+from .rolling import LEAST_GAIN, NO_READOUT, Readout, RollingModel, estimate, rectified_bundle, velocities
 from .seams import remove_keyframes
 
 _SUREST_PX = 1e-3

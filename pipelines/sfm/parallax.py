@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError
-from ..correspondence.matching import VerifiedPair
 from ..geometry.se3 import best_rotation
+from .matching import VerifiedPair
 
 HOW_TO_FILM = (
     "Film again while walking: move the camera sideways by a tenth of the distance to what it shows, rather than "

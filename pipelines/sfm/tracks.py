@@ -11,8 +11,8 @@ from collections.abc import Iterable
 
 import pycolmap
 
-from ..correspondence.matching import VerifiedPair
 from .adjust import median_error
+from .matching import VerifiedPair
 
 _FAR_OFF = 8.0
 """Median errors within which an observation belongs to a point, at most COLMAP's own limits. Of half, once and twice as

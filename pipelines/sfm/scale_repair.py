@@ -14,9 +14,9 @@ import pycolmap
 from numpy.typing import NDArray
 
 from ...formats.reconstruction import pose_of, set_pose
-from ..correspondence.matching import VerifiedPair
 from .adjust import filter_outliers, solve
 from .consistency import ModelReport, judge
+from .matching import VerifiedPair
 from .seams import LEAST_POINTS, parts_of, tracks_of
 from .tracks import complete_tracks
 

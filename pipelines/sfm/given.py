@@ -9,11 +9,11 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from ..correspondence.matching import VerifiedPair
 from ..geometry import se3
 from ..geometry.se3 import Similarity, best_rotation
 from .adjust import filter_outliers, solve
 from .consistency import unexplained
+from .matching import VerifiedPair
 from .seams import LEAST_POINTS, remove_keyframes
 from .tracks import complete_tracks
 

@@ -1,1 +1,0 @@
-"""Features, matches and retrieval between keyframes."""
