@@ -15,7 +15,7 @@ from .stereo.fill import SURE
 from .stereo.provider import MultiviewDepth
 
 _GRID_REACH = 1 / 10
-"""Standard deviation of the scale grid's smoothing, as a part of the image's width."""
+"""Standard deviation of the scale grid's smoothing, as a part of the image's longer side."""
 _PRIOR = 0.02
 _TRUSTED_SPREAD = 0.05
 _LEARNED_CONFIDENCE = 0.7
@@ -104,7 +104,7 @@ def _smooth_field(
     ratio: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weighted local mean of the log ratio, 0 far from any evidence, and the local spread around it."""
-    sigma = ratio.shape[1] * _GRID_REACH
+    sigma = max(ratio.shape) * _GRID_REACH
     # A blur over a quarter-size image is the same field at a sixteenth of the time.
     size = (max(1, ratio.shape[1] // 4), max(1, ratio.shape[0] // 4))
 

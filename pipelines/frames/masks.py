@@ -22,6 +22,10 @@ from ..source.opening import Source, open_source
 from ..system.progress import Progress
 from ..types import Frame, any_of
 
+_LITTLE, _LOOKED_AT = 0.05, 40
+"""Share of an image that masks leave, in the middle of so many, below which they are the reason where nothing is found.
+"""
+
 
 def mask_inputs(source: Path, config: Config) -> dict[str, str] | None:
     """Return digests of the user's masks and of the networks for people; None without any."""
@@ -92,6 +96,18 @@ class FrameMasks:
         """(height, width) of the source's image `index`, its transparent background at a size (width, height)."""
         clear = self._source.transparent(index)
         return None if clear is None else reduce_mask(clear, *size)
+
+    def blame(self, frames: Sequence[Frame], width: int, height: int) -> str | None:
+        """Return why nothing can be reconstructed of picked frames of this size, where masks leave next to nothing."""
+        some = [self.left_out(f, width, height) for f in frames[:: -(-len(frames) // _LOOKED_AT)]]
+        left = float(np.median([1.0 if m is None else 1 - m.mean() for m in some]))
+        if left >= _LITTLE:
+            return None
+        by, rule = "the transparent backgrounds of the images", "Give the images without transparency"
+        if self._files.paths:
+            by = f"the masks of --masks {next(iter(self._files.paths.values())).parent}"
+            rule = "Black (0) is left out, all else is kept: invert masks that mean the opposite, or omit --masks"
+        return f"{by} leave only {left:.1%} of the images, too little for a reconstruction. {rule}"
 
     def write(self, folder: Path, frames: Sequence[Frame], lens: Lens) -> dict[str, Any]:
         """Write the masks of the undistorted frames that have any; how many these are, and how much they leave out."""

@@ -84,9 +84,14 @@ def run(context: StageContext) -> dict[str, Any]:
     given = given_poses(context.config.frames, source, frames, context.warn)
     rig = rig_of(1 if faces is None else len(faces), len(frames))
     masks = masks_of(context, source, faces, rig)
-    keyframes = _keyframes(context, frames, masks, rig)
-    masks.find_people(frames, keyframes, context.progress)
-    structure, origin = _structure(context, (camera, origin), frames, keyframes, masks, rig, given)
+    try:
+        keyframes = _keyframes(context, frames, masks, rig)
+        masks.find_people(frames, keyframes, context.progress)
+        structure, origin = _structure(context, (camera, origin), frames, keyframes, masks, rig, given)
+    except InputError as error:
+        if blame := masks.blame(frames, camera.width, camera.height):
+            raise InputError(blame) from error
+        raise
     lens = make_lens(structure.model.cameras[1])
     origin = settled_origin(context, origin, camera, structure)
     calibration = replace(_calibration(context, lens, origin, structure.focal_sd, faces), readout=structure.readout)

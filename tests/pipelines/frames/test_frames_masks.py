@@ -3,9 +3,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_grey_png, read_rgb, write_grey_png, write_rgb
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import run
@@ -32,6 +34,29 @@ def crossing(bent_walk: Walk, tmp_path: Path) -> Moving:
         write_grey_png(tmp_path / "masks" / f"{path.name}.png", np.where(left_out, 0, 255).astype(np.uint8))
         covered.append(left_out)
     return tmp_path / "pictures", tmp_path / "masks", covered
+
+
+@pytest.mark.parametrize("by", ["masks", "thin masks", "transparency"])
+def test_masks_over_everything_are_named_as_the_reason(
+    bent_walk: Walk, tmp_path: Path, make_context: Callable[..., StageContext], by: str
+) -> None:
+    kept = np.zeros((HEIGHT, WIDTH), np.uint8)
+    kept[:2] = 255 * (by == "thin masks")
+    pictures = bent_walk.folder
+    for path in sorted(pictures.iterdir()):
+        if by == "transparency":
+            (tmp_path / "clear").mkdir(exist_ok=True)
+            cv2.imwrite(str(tmp_path / "clear" / f"{path.stem}.png"), np.dstack([cv2.imread(str(path)), kept]))
+        else:
+            write_grey_png(tmp_path / "masks" / f"{path.name}.png", kept)
+    masks = "" if by == "transparency" else str(tmp_path / "masks")
+    said = (
+        "--masks.*leave only 0.[08]%.*invert"
+        if masks
+        else "transparent backgrounds.*leave only 0.0%.*without transparency"
+    )
+    with pytest.raises(InputError, match=said):
+        run(make_context(tmp_path / "clear" if not masks else pictures, f'frames.masks="{masks}"'))
 
 
 def test_a_board_that_crosses_the_picture_leaves_no_trace(

@@ -170,6 +170,18 @@ def test_two_guesses_that_miss_differently_are_better_together() -> None:
     assert np.abs(fused.depth[22:38, 66:] / whole[22:38, 66:] - 0.95).max() < 0.01
 
 
+def test_the_scale_field_of_a_portrait_image_is_that_of_a_landscape_one_on_its_side() -> None:
+    rng = np.random.default_rng(3)
+    ratio, confidence = np.exp(rng.normal(0, 0.05, (48, 96))), np.where(rng.random((48, 96)) < 0.3, 0.9, 0.0)
+
+    def fused(turns: int) -> np.ndarray:
+        geometry = DepthEstimate(*(np.rot90(a, turns).astype(np.float32) for a in (2 * ratio, confidence)))
+        learned = DepthEstimate(np.full_like(geometry.depth, 2.0), np.ones_like(geometry.depth))
+        return np.rot90(fuse(learned, geometry, 1.0, 1.0).depth, -turns)
+
+    np.testing.assert_allclose(fused(1), fused(0), rtol=1e-5)
+
+
 def test_regions_mean_the_same_in_all_frames_and_know_the_floor(room: Room) -> None:
     truth = {
         f.id: DepthEstimate(room.views[f.id].depth * np.float32(UNIT), np.full(room.views[0].depth.shape, 0.9, "f4"))
