@@ -73,16 +73,16 @@ class Provider(Protocol):
     name: str
 
     @property
-    def of_all(self) -> tuple[str, ...]:
-        """The names of what `prepare` finds out of all frames together, and of the providers inside this one."""
+    def shared_state(self) -> tuple[str, ...]:
+        """The names of what `fit` finds out of all frames together, and of the providers inside this one."""
         return ()
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames it will know nothing of."""
         return []
 
-    def look(self, frames: list[Frame]) -> None:
-        """Do the part of `prepare` that concerns single frames, for these; results are kept."""
+    def precompute(self, frames: list[Frame]) -> None:
+        """Do the part of `fit` that concerns single frames, for these; results are kept."""
         return
 
     def figures(self) -> dict[str, Any]:
@@ -90,17 +90,17 @@ class Provider(Protocol):
         return {}
 
 
-def prepared(provider: Provider) -> dict[str, Any]:
-    """Return the state that `prepare` left, to send to the processes that estimate single frames."""
-    found = {name: getattr(provider, name) for name in provider.of_all}
-    return {name: prepared(v) if hasattr(v, "of_all") else v for name, v in found.items()}
+def dump_state(provider: Provider) -> dict[str, Any]:
+    """Return the state that `fit` left, to send to the processes that estimate single frames."""
+    found = {name: getattr(provider, name) for name in provider.shared_state}
+    return {name: dump_state(v) if hasattr(v, "shared_state") else v for name, v in found.items()}
 
 
-def take_prepared(provider: Provider, found: dict[str, Any]) -> None:
-    """Take over the state of `prepared` in place of calling `prepare`; `estimate` may be called afterwards."""
+def load_state(provider: Provider, found: dict[str, Any]) -> None:
+    """Take over the state of `dump_state` in place of calling `fit`; `estimate` may be called afterwards."""
     for name, value in found.items():
-        if hasattr(own := getattr(provider, name), "of_all"):
-            take_prepared(own, value)
+        if hasattr(own := getattr(provider, name), "shared_state"):
+            load_state(own, value)
         else:
             setattr(provider, name, value)
 
@@ -111,7 +111,7 @@ class DepthProvider(Provider, Protocol):
     metric: bool
     """Whether depths are metres; else they are in the unit of the run's backbone."""
 
-    def prepare(self, frames: list[Frame]) -> None:
+    def fit(self, frames: list[Frame]) -> None:
         """Slow passes over all frames that `estimate` builds on; goes on where it was interrupted."""
         return
 
@@ -123,11 +123,11 @@ class DepthProvider(Provider, Protocol):
 class SemanticsProvider(Provider, Protocol):
     """Class of every pixel of every frame."""
 
-    def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
+    def fit(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Slow passes over all frames that `estimate` and `classes` build on."""
 
     def warnings(self) -> list[str]:
-        """Return the problems that `prepare` found, for the report."""
+        """Return the problems that `fit` found, for the report."""
         return []
 
     def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
@@ -135,7 +135,7 @@ class SemanticsProvider(Provider, Protocol):
         ...
 
     def classes(self) -> ClassTable:
-        """Return the table of classes; valid after `prepare`."""
+        """Return the table of classes; valid after `fit`."""
         ...
 
 

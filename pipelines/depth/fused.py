@@ -34,7 +34,7 @@ class FusedDepth(DepthProvider):
     bent to the geometry around it by a smooth scale field of the frame, together with what the geometry guesses there.
     """
 
-    of_all = ("_learned", "_stereo", "_scale")
+    shared_state = ("_learned", "_stereo", "_scale")
 
     def __init__(self, learned: DepthProvider, stereo: MultiviewDepth, sequence: Sequence) -> None:
         self._learned, self._stereo, self._sequence = learned, stereo, sequence
@@ -46,15 +46,15 @@ class FusedDepth(DepthProvider):
         """The frames that neither knows."""
         return [f for f in self._learned.missing(frames) if f in self._stereo.missing(frames)]
 
-    def look(self, frames: list[Frame]) -> None:
+    def precompute(self, frames: list[Frame]) -> None:
         """Run the passes of both providers on these frames."""
-        self._learned.look(frames)
-        self._stereo.look(frames)
+        self._learned.precompute(frames)
+        self._stereo.precompute(frames)
 
-    def prepare(self, frames: list[Frame]) -> None:
+    def fit(self, frames: list[Frame]) -> None:
         """Both providers' passes, then the scale between them."""
-        self._learned.prepare(frames)
-        self._stereo.prepare(frames)
+        self._learned.fit(frames)
+        self._stereo.fit(frames)
         self._scale = measure_scale(self._sequence, frames, self._learned.estimate)
 
     def estimate(self, frame: Frame) -> DepthEstimate:

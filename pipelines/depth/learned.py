@@ -40,13 +40,13 @@ class OnnxDepth(DepthProvider):
         identity = f"{card_identity(card)} {place.sequence.intrinsics}"
         self._pass = NetworkPass(self.name, identity, place, self._compute)
 
-    def look(self, frames: list[Frame]) -> None:
+    def precompute(self, frames: list[Frame]) -> None:
         """Run the network; what is on disk stays."""
         self._pass.run(frames)
 
-    def prepare(self, frames: list[Frame]) -> None:
+    def fit(self, frames: list[Frame]) -> None:
         """Run the network over all frames."""
-        self.look(frames)
+        self.precompute(frames)
         self._frames = frames
 
     def _compute(self, image: NDArray[np.uint8]) -> Arrays:
@@ -88,7 +88,7 @@ class AlignedDepth(DepthProvider):
     """
 
     metric = False
-    of_all = ("_learned", "_fits")
+    shared_state = ("_learned", "_fits")
 
     def __init__(self, learned: OnnxDepth, sequence: Sequence, relative: str) -> None:
         """Raises InputError without a backbone: nothing else gives the frames' scales."""
@@ -106,13 +106,13 @@ class AlignedDepth(DepthProvider):
         """The frames without a pose, whose scale is therefore unknown."""
         return [f for f in frames if f.id not in self._sequence.cam_from_world]
 
-    def look(self, frames: list[Frame]) -> None:
+    def precompute(self, frames: list[Frame]) -> None:
         """Run the network on these frames."""
-        self._learned.look(frames)
+        self._learned.precompute(frames)
 
-    def prepare(self, frames: list[Frame]) -> None:
+    def fit(self, frames: list[Frame]) -> None:
         """The network's pass, then scale and shift of every frame."""
-        self._learned.prepare(frames)
+        self._learned.fit(frames)
         posed = [f for f in frames if f.id in self._sequence.cam_from_world]
         seen = [depth_at_points(self._sequence, f, self._learned.estimate(f).depth) for f in posed]
         for i, frame in enumerate(posed):

@@ -128,7 +128,7 @@ _ENTRIES = (
 )  # fmt: skip
 
 _UPRIGHT = """\
-Axes: z is up, from the {told_by}; {height}.
+Axes: z is up, from the {source}; {height}.
 {heading}. The formats that define the up axis follow their own rule: in all GLB files and in point_cloud.spz y is
 up. A viewer that takes y for up shows the PLY files on their back: turn them by -90 degrees about x.
 """
@@ -160,7 +160,7 @@ def readme(world: World, metres: Metres | None, metric: bool, only: str | None =
     if world.axes == "up":
         height = "the floor is at z = 0" if world.has_floor else "no floor was found, so z counts from that path too"
         heading = "x is east and y north (GPS, see world.json)" if world.earth else _OWN_HEADING
-        axes = _UPRIGHT.format(told_by=world.told_by, height=height, heading=heading)
+        axes = _UPRIGHT.format(source=world.source, height=height, heading=heading)
     else:
         axes = _FIRST.format(why=", since the gravity direction is unknown or was not asked for (export.axes)")
     entries = [e.lines for e in _ENTRIES if only is None or e.kind in (only, "*")]

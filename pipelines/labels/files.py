@@ -30,7 +30,7 @@ class FilesLabels(SemanticsProvider):
     named by its number, except 255 (65535 in 16 bit), which is void.
     """
 
-    of_all = ("_label_of",)
+    shared_state = ("_label_of",)
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class FilesLabels(SemanticsProvider):
         self._outside: dict[int, int] = {}
         self._read(next(iter(self._files)))
 
-    def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
+    def fit(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Count the ids of all frames and give labels to those that are classes. InputError for more than 254."""
         counts = np.zeros(MAX_ID + 1, np.int64)
         ids = [f.id for f in frames if f.id in self._files]

@@ -24,7 +24,6 @@ _SAMPLE = 20000
 _ROUNDS = 20
 _SOFTNESS = 0.1
 """Cosine similarity by which a cluster must lead to be e times as likely."""
-
 _LEAST_SHARE = 0.001
 """A class on a smaller share of all pixels is noise of the network and becomes void."""
 _SIDE = 160
@@ -36,7 +35,7 @@ _STEPS = 16
 class OnnxLabels(SemanticsProvider):
     """Only the classes that occur in the video are kept."""
 
-    of_all: tuple[str, ...] = ("_label_of", "_scene")
+    shared_state: tuple[str, ...] = ("_label_of", "_scene")
 
     def __init__(self, card: Card, place: Workplace, most: int) -> None:
         """Opens the network; `most` numbered objects of what has no name. Raises InputError when the network cannot be
@@ -60,13 +59,13 @@ class OnnxLabels(SemanticsProvider):
             camera = place.sequence.intrinsics
             self._compute(np.full((camera.height, camera.width, 3), 128, np.uint8))
 
-    def look(self, frames: list[Frame]) -> None:
+    def precompute(self, frames: list[Frame]) -> None:
         """Run the network; what is on disk stays."""
         self._pass.run(frames)
 
-    def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
+    def fit(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Let the network look, let all frames vote on the names of the places they see, and settle the classes."""
-        self.look(frames)
+        self.precompute(frames)
         self._learn(frames)
         if self._has_world(frames, depth_of):
             segments = SegmentLabels(self._sequence, self._most, self._progress)
@@ -105,19 +104,19 @@ class OnnxLabels(SemanticsProvider):
     def _compute(self, image: NDArray[np.uint8]) -> Arrays:
         height, width = image.shape[:2]
         output = self._network.run(image, self._network.box(width, height))["output"]
-        halvings = -np.log2(np.maximum(network_probabilities(self._network, output, width, height, _SIDE), 1e-9))
-        arrays: Arrays = {"halvings": np.minimum(np.round(halvings * _STEPS), 255).astype(np.uint8)}
+        neg_log2_prob = -np.log2(np.maximum(network_probabilities(self._network, output, width, height, _SIDE), 1e-9))
+        arrays: Arrays = {"halvings": np.minimum(np.round(neg_log2_prob * _STEPS), 255).astype(np.uint8)}
         token = class_token(self._network, output, width, height)
         return arrays if token is None else {**arrays, "descriptor": token}
 
     def _learn(self, frames: list[Frame]) -> None:
-        """What has to be known of all frames before `_probabilities`: nothing, the network knows its classes."""
+        """Learn from all frames what `_probabilities` needs: nothing, the network knows its classes."""
 
     def _probabilities(self, frame: Frame) -> NDArray[np.float32]:
         """(rows, columns, C) over the whole image; 0 where the network says nothing."""
-        halvings = self._pass.load(frame)["halvings"]
-        said = np.exp2(-halvings.astype(np.float32) / np.float32(_STEPS))
-        return np.where(halvings.min(-1, keepdims=True) < 255, said, 0).astype(np.float32)
+        neg_log2_prob = self._pass.load(frame)["halvings"]
+        said = np.exp2(-neg_log2_prob.astype(np.float32) / np.float32(_STEPS))
+        return np.where(neg_log2_prob.min(-1, keepdims=True) < 255, said, 0).astype(np.float32)
 
     def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
         """Return labels fused over all frames that see the same places; without a world, this frame's alone."""
@@ -142,7 +141,7 @@ class OnnxLabels(SemanticsProvider):
 class OnnxClusters(OnnxLabels):
     """Classes by clustering features: "cluster 1" is the most frequent; spherical k-means with a fixed seed."""
 
-    of_all = (*OnnxLabels.of_all, "_centres")
+    shared_state = (*OnnxLabels.shared_state, "_centres")
 
     def __init__(self, card: Card, place: Workplace, most: int) -> None:
         """`most` clusters at the most. Raises InputError as `OnnxLabels`."""

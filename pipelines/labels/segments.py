@@ -36,7 +36,7 @@ class SegmentLabels(SemanticsProvider):
     """Unsupervised regions; needs poses (a backbone), because they make the regions consistent over the video."""
 
     name = "segments"
-    of_all = ("_size", "_keys", "_label", "_classes")
+    shared_state = ("_size", "_keys", "_label", "_classes")
 
     def __init__(self, sequence: Sequence, most: int, progress: Progress) -> None:
         """`most` classes at the most. Raises InputError without a backbone."""
@@ -57,7 +57,7 @@ class SegmentLabels(SemanticsProvider):
         """The frames without a pose."""
         return [f for f in frames if f.id not in self._world_from_cam]
 
-    def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
+    def fit(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Gather all frames and cut the scene."""
         voxels, gravity, kind = self.structure(frames, depth_of)
         self._name(kind, cut_parts(select(voxels, kind == OTHER), self._most - len(NAMES) - 1))

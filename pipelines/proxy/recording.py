@@ -67,7 +67,7 @@ class RecordingDepth(_RecordingMaps, DepthProvider):
 class RecordingLabels(_RecordingMaps, SemanticsProvider):
     """The classes of the data set that occur in the frames, with its names and colours."""
 
-    of_all = ("_label_of",)
+    shared_state = ("_label_of",)
 
     def __init__(self, recording: Recording, sequence: Sequence, progress: Progress) -> None:
         """Raises InputError for a data set without labels."""
@@ -80,7 +80,7 @@ class RecordingLabels(_RecordingMaps, SemanticsProvider):
         self._label_of = np.full(256, VOID, np.uint8)
         self._classes = ClassTable((), ())
 
-    def prepare(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
+    def fit(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Find the classes that occur. Raises InputError where there is none."""
         seen = np.zeros(256, bool)
         for frame in self._progress.track(frames, "labels", len(frames)):
@@ -109,7 +109,7 @@ class RecordingLabels(_RecordingMaps, SemanticsProvider):
         return LabelEstimate(labels, (labels != VOID).astype(np.float32))
 
     def classes(self) -> ClassTable:
-        """Return the classes that occur; valid after `prepare`."""
+        """Return the classes that occur; valid after `fit`."""
         return self._classes
 
     def files(self) -> list[Path]:

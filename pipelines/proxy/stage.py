@@ -12,7 +12,7 @@ from ..depth.scale import DepthScale, measure_scale
 from ..depth.stereo.provider import MultiviewDepth
 from ..engine.stages import Stage, StageContext
 from ..masks.moving import find_moving
-from ..providers import prepared
+from ..providers import dump_state
 from ..run.files import CLASSES, DESCRIPTORS, FIGURES, FRAME_SCALES, LEFT_OUT, PROXY_MAPS
 from ..system.progress import log
 from ..types import VOID, Frame
@@ -61,7 +61,9 @@ def _frames_to_do(work: ProxyWork) -> list[Frame]:
 
 
 def _warn_of_missing(work: ProxyWork, frames: list[Frame]) -> None:
-    """Of frames without a map, and of maps that show what the frames no longer do."""
+    """Warn of frames without a map, and of map files that show the lens distortion which the frames have lost.
+
+    Raises InputError where no frame has a map."""
     for kind, provider in (("depth", work.depths), ("label", work.semantics)):
         missing = provider.missing(frames)
         if len(missing) == len(frames):
@@ -80,22 +82,22 @@ def _warn_of_missing(work: ProxyWork, frames: list[Frame]) -> None:
 
 
 def _compute_depths(work: ProxyWork, frames: list[Frame]) -> None:
-    """Into the snapshot."""
+    """Compute the depth of every frame and store it in the snapshot."""
     in_frames(work, look_for_depth, frames)
-    work.depths.prepare(frames)
-    in_frames(work, make_depths, frames, depths=prepared(work.depths))
+    work.depths.fit(frames)
+    in_frames(work, make_depths, frames, depths=dump_state(work.depths))
 
 
 def _compute_maps(work: ProxyWork, frames: list[Frame], scale: DepthScale, reference: ReferenceScale | None) -> None:
-    """The result, in metres where there is a `reference`."""
+    """Compute labels and the stored maps of every frame, in metres where there is a `reference`."""
     folder, semantics = work.context.folder, work.semantics
     in_frames(work, look_for_labels, frames)
-    semantics.prepare(frames, lambda frame: scale.in_backbone_unit(work.depth(frame)))
+    semantics.fit(frames, lambda frame: scale.in_backbone_unit(work.depth(frame)))
     for message in semantics.warnings():
         work.context.warn(message)
     CLASSES.save(folder, semantics.classes())
     metres = reference.factor if reference else 1.0
-    made = in_frames(work, make_maps, frames, scale=scale, metres=metres, semantics=prepared(semantics))
+    made = in_frames(work, make_maps, frames, scale=scale, metres=metres, semantics=dump_state(semantics))
     if descriptors := {i: looks for part in made for i, looks in part.items()}:
         DESCRIPTORS.save(folder, descriptors)
     scales = scale.of_frame.items()
@@ -105,7 +107,8 @@ def _compute_maps(work: ProxyWork, frames: list[Frame], scale: DepthScale, refer
 
 
 def _warn_of_focal(work: ProxyWork, network_focal: float | None) -> None:
-    """A network that tells the camera from one picture is good to some per cent: it can only doubt a calibration."""
+    """Warn where the depth network sees quite another focal length than the calibration has; from one image it is good
+    to some per cent, and can only doubt a calibration."""
     calibration = work.sequence.calibration
     focal = calibration.intrinsics.fx
     if network_focal is None or calibration.origin == "given" or abs(network_focal / focal - 1) < 0.15:
@@ -117,7 +120,7 @@ def _warn_of_focal(work: ProxyWork, network_focal: float | None) -> None:
 
 
 def _warn_of_guesses(work: ProxyWork, reliable: float) -> None:
-    """What the images do not fix is filled in, and the picture of the map does not show it."""
+    """Warn where most of the depth is filled in: an image of the map does not show it."""
     if work.depths.name == MultiviewDepth.name and reliable < _MOSTLY_MATCHED:
         work.context.warn(
             f"only {reliable:.0%} of the pixels could be matched between views; elsewhere (bare walls, plain floors) "
@@ -127,7 +130,8 @@ def _warn_of_guesses(work: ProxyWork, reliable: float) -> None:
 
 
 def _leave_out_moving(work: ProxyWork, frames: list[Frame], scale: DepthScale) -> dict[str, float | int]:
-    """Masks of what moved; says in how many frames, and how much of those. Made anew from the depth when resumed."""
+    """Store masks of what moved; return in how many frames, and how much of those. Made anew from the depth when
+    resumed."""
     if work.context.config.proxy.moving != "auto":
         return {}
     posed = work.posed(frames)
@@ -142,7 +146,7 @@ def _leave_out_moving(work: ProxyWork, frames: list[Frame], scale: DepthScale) -
 
 
 def _figures(work: ProxyWork, frames: list[Frame]) -> dict[str, Any]:
-    """For the report."""
+    """Summarise the stage for the report."""
     sizes, reliable, void = [], [], []
     invalid = 0
     for frame in frames:

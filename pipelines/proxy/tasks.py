@@ -23,8 +23,8 @@ from ..providers import (
     LabelEstimate,
     SemanticsProvider,
     Sequence,
+    load_state,
     resize_area,
-    take_prepared,
 )
 from ..run.files import BACKBONE, CALIBRATION, FRAMES, LEFT_OUT, PROXY_MAPS
 from ..source.recording import open_recording
@@ -118,7 +118,7 @@ def load_sequence(context: StageContext) -> Sequence:
     run = context.run
 
     def left_out(frame: Frame) -> NDArray[np.bool_] | None:
-        """By the stage before this one, and by what of this one is done."""
+        """Return the pixels that any earlier step masks out."""
         return any_of((run.find(LEFT_OUT, of=frame.name), LEFT_OUT.find(context.folder, frame.name)))
 
     return Sequence(run.load(FRAMES), calibration, camera, run.find(BACKBONE), run.image, left_out)
@@ -140,13 +140,13 @@ def _opened(task: Chunk, progress: Progress) -> tuple[ProxyWork, list[Frame]]:
 def look_for_depth(task: Chunk, progress: Progress) -> None:
     """Run the slow passes of the depth provider over single frames."""
     work, frames = _opened(task, progress)
-    work.depths.look(frames[task.first : task.last])
+    work.depths.precompute(frames[task.first : task.last])
 
 
 def make_depths(task: Chunk, progress: Progress) -> None:
     """The depths of the frames."""
     work, frames = _opened(task, progress)
-    take_prepared(work.depths, task.known["depths"])
+    load_state(work.depths, task.known["depths"])
     done = abreast(work.save_depth, frames[task.first : task.last], work.context.threads)
     for _ in progress.track(done, "depth", len(task.numbers)):
         pass
@@ -161,14 +161,14 @@ def look_for_moving(task: Chunk, progress: Progress) -> dict[int, NDArray[np.boo
 def look_for_labels(task: Chunk, progress: Progress) -> None:
     """Run the network for labels over single frames."""
     work, frames = _opened(task, progress)
-    work.semantics.look(frames[task.first : task.last])
+    work.semantics.precompute(frames[task.first : task.last])
 
 
 def make_maps(task: Chunk, progress: Progress) -> dict[int, NDArray[np.float32]]:
     """Labels and reliability of the frames; known["metres"] turns the provider's depth into that of the maps. Returns
     what a network says of how frames look, by id."""
     work, frames = _opened(task, progress)
-    take_prepared(work.semantics, task.known["semantics"])
+    load_state(work.semantics, task.known["semantics"])
     scale, metres = task.known["scale"], np.float32(task.known["metres"])
 
     def make(frame: Frame) -> tuple[int, NDArray[np.float32] | None]:

@@ -46,12 +46,12 @@ _AGREE = 3.0
 @dataclass(frozen=True)
 class Upright:
     """`up` (3,) unit vector in the run's world and its source, "" where none; `floor` (3,) a point of the
-    floor, None without one; `against`: degrees between up and what each witness says alone."""
+    floor, None without one; `disagreement_deg`: degrees between up and what each witness says alone."""
 
     up: Array
-    told_by: str
+    source: str
     floor: Array | None
-    against: dict[str, float] = field(default_factory=dict)
+    disagreement_deg: dict[str, float] = field(default_factory=dict)
 
 
 def cameras_up(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -88,9 +88,9 @@ def find_upright(outcome: Outcome) -> Upright:
     witnesses = {"cameras": prior, "level surfaces": level.up}
     witnesses |= {"upright lines": lines.up} if lines.is_sure else {}
     witnesses |= {"floor": floor.normal} if floor else {}
-    up, told_by = _verdict(witnesses)
-    against = {name: round(_degrees(up, w), 2) for name, w in witnesses.items()}
-    return Upright(up, told_by, floor.point if floor else None, against)
+    up, source = _verdict(witnesses)
+    disagreement = {name: round(_degrees(up, w), 2) for name, w in witnesses.items()}
+    return Upright(up, source, floor.point if floor else None, disagreement)
 
 
 def _verdict(witnesses: dict[str, Array]) -> tuple[Array, str]:
@@ -98,8 +98,8 @@ def _verdict(witnesses: dict[str, Array]) -> tuple[Array, str]:
     floor, lines = witnesses.get("floor"), witnesses.get("upright lines")
     if floor is not None and lines is not None and _degrees(floor, lines) < _AGREE:
         return (floor + lines) / float(np.linalg.norm(floor + lines)), "floor and upright lines"
-    told_by = "upright lines" if lines is not None else "floor" if floor is not None else "level surfaces"
-    return witnesses[told_by], told_by
+    source = "upright lines" if lines is not None else "floor" if floor is not None else "level surfaces"
+    return witnesses[source], source
 
 
 def surface_voxels(outcome: Outcome, rows: Sequence[int]) -> Voxels:

@@ -42,10 +42,10 @@ class World:
     "metre" or "free"."""
 
     axes: str
-    told_by: str
+    source: str
     has_floor: bool
     exported_from_run: Similarity
-    against: dict[str, float] = field(default_factory=dict)
+    disagreement_deg: dict[str, float] = field(default_factory=dict)
     earth: Georeference | None = None
     unit: str = "free"
 
@@ -68,7 +68,7 @@ def upright_world(outcome: Outcome, found: Upright) -> World:
 
     Without a floor z counts from the middle of the path too. `FIRST` where up is unknown.
     """
-    if not found.told_by:
+    if not found.source:
         return FIRST
     trajectory = outcome.trajectory
     world_from_cam = trajectory.world_from_cam[trajectory.is_posed]
@@ -76,7 +76,9 @@ def upright_world(outcome: Outcome, found: Upright) -> World:
     middle = rotation @ world_from_cam[:, :3, 3].mean(axis=0)
     if found.floor is not None:
         middle[2] = (rotation @ found.floor)[2]
-    return World("up", found.told_by, found.floor is not None, Similarity(1.0, rotation, -middle), found.against)
+    return World(
+        "up", found.source, found.floor is not None, Similarity(1.0, rotation, -middle), found.disagreement_deg
+    )
 
 
 def _level_axes(up: Array, world_from_cam: Array) -> Array:
@@ -91,7 +93,7 @@ def _level_axes(up: Array, world_from_cam: Array) -> Array:
 
 def world_figures(world: World) -> dict[str, Any]:
     """For the table of the run."""
-    figures = {"up": world.told_by or "unknown", "floor": world.has_floor, "degrees_from_up": world.against}
+    figures = {"up": world.source or "unknown", "floor": world.has_floor, "degrees_from_up": world.disagreement_deg}
     if world.earth is not None:
         e = world.earth
         figures["gps"] = {"used": e.used, "of": e.fixes, "residual_m": e.residual, "scale_relative_sd": e.scale_sd}
@@ -104,10 +106,10 @@ def _pack(world: World) -> dict[str, Any]:
     return {
         "axes": world.axes,
         "up": "z" if world.axes == "up" else "unknown",
-        "up_told_by": world.told_by,
+        "up_told_by": world.source,
         "floor_at_zero": world.has_floor,
         "unit": world.unit,
-        "degrees_from_up": world.against,
+        "degrees_from_up": world.disagreement_deg,
         **({} if world.earth is None else {"georeference": asdict(world.earth) | {"frame": "east north up"}}),
         "exported_from_run": {
             "scale": move.scale, "rotation": move.rotation.tolist(), "translation": move.translation.tolist()
@@ -120,10 +122,10 @@ def _unpack(value: Any) -> World:
     rotation, translation = (np.array(move[name], dtype=np.float64) for name in ("rotation", "translation"))
     return World(
         axes=str(value["axes"]),
-        told_by=str(value["up_told_by"]),
+        source=str(value["up_told_by"]),
         has_floor=bool(value["floor_at_zero"]),
         exported_from_run=Similarity(float(move["scale"]), rotation, translation),
-        against={str(name): float(v) for name, v in value["degrees_from_up"].items()},
+        disagreement_deg={str(name): float(v) for name, v in value["degrees_from_up"].items()},
         earth=None
         if earth is None
         else dataclass_from_json(Georeference, {k: earth[k] for k in earth if k != "frame"}),

@@ -108,7 +108,7 @@ def measure_depth(folder: Path, truth: Path, matches: Path) -> dict[str, float]:
     camera = calibration.intrinsics.at_most(config.max_side)
     sequence = Sequence(run.load(FRAMES), calibration, camera, run.load(BACKBONE), run.image)
     stereo = MultiviewDepth(sequence, config.stereo_side, config.stereo_planes, lambda: matches, 1, SilentProgress())
-    stereo.look(sequence.frames)
+    stereo.precompute(sequence.frames)
     truths, views = true_depths(run, truth), []
     for frame in sequence.frames:
         if frame.id in truths and frame.id in sequence.cam_from_world:

@@ -100,7 +100,7 @@ def with_names(run: RunFolder, seen: Seen, store: ModelStore) -> Seen:
             sequence, lambda: Path(scratch), 1, "cpu", SilentProgress(), ResultCache(Path(scratch) / "kept", 0)
         )
         labels = OnnxLabels(store.card(model), place, 16)
-        labels.prepare(frames, lambda frame: depths[frame.id])
+        labels.fit(frames, lambda frame: depths[frame.id])
         maps_of = {}
         for frame in frames:
             found = labels.estimate(frame, depths[frame.id])

@@ -52,8 +52,8 @@ def judge(run: Path, truth: Path, true_up: np.ndarray) -> None:
     found = find_upright(outcome)
     seconds = time.process_time() - began
     off = np.degrees(np.arccos(np.clip(found.up @ up_in_run, -1, 1)))
-    print(f"{run.name}: up {off:.2f} degrees off, told by {found.told_by or 'nothing'}, {seconds:.1f} s CPU", end="")
-    print("".join(f"; {name} {degrees} from it" for name, degrees in found.against.items()))
+    print(f"{run.name}: up {off:.2f} degrees off, told by {found.source or 'nothing'}, {seconds:.1f} s CPU", end="")
+    print("".join(f"; {name} {degrees} from it" for name, degrees in found.disagreement_deg.items()))
     world = upright_world(outcome, found)
     points, _ = true_surface(matched)
     if len(points) and world.has_floor:

@@ -63,7 +63,7 @@ class MultiviewDepth:
 
     metric = False
     name = "multiview"
-    of_all = ()
+    shared_state = ()
 
     def __init__(
         self,
@@ -103,11 +103,11 @@ class MultiviewDepth:
 
     # first pass -------------------------------------------------------------------------------------------------
 
-    def prepare(self, frames: list[Frame]) -> None:
+    def fit(self, frames: list[Frame]) -> None:
         """Look at all: nothing is found out of them together."""
-        self.look(frames)
+        self.precompute(frames)
 
-    def look(self, frames: list[Frame]) -> None:
+    def precompute(self, frames: list[Frame]) -> None:
         """A raw depth map of every keyframe, on disk."""
         known = [f for f in frames if f.id in self._index]
         for _ in self._progress.track(abreast(self._look_at, known, self._threads), "stereo", len(known)):

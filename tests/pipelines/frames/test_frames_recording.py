@@ -112,7 +112,7 @@ def test_depth_and_labels_of_the_set_are_the_oracle(layout: str, short: Sequence
         return
     labels = open_label_files(around, "")
     assert isinstance(labels, RecordingLabels)
-    labels.prepare(around.sequence.frames, lambda frame: depths.estimate(frame))
+    labels.fit(around.sequence.frames, lambda frame: depths.estimate(frame))
     true = short.labels(3)
     assert true is not None
     given = labels.estimate(around.sequence.frames[3], found).labels

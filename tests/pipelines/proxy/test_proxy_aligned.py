@@ -26,7 +26,7 @@ class Relative:
         self.scales = rng.uniform(0.5, 4, len(room.frames))
         self.shifts = np.zeros(len(room.frames)) if relative == "scale" else rng.uniform(0.1, 0.6, len(room.frames))
 
-    def prepare(self, frames: list[Frame]) -> None:
+    def fit(self, frames: list[Frame]) -> None:
         pass
 
     def figures(self) -> dict[str, Any]:
@@ -45,7 +45,7 @@ def test_frames_of_any_scale_come_to_one(room: Room, relative: str) -> None:
     sequence = room.sequence()
     network: Any = Relative(room, relative)
     provider = AlignedDepth(network, sequence, relative)
-    provider.prepare(room.frames)
+    provider.fit(room.frames)
     assert (provider.metric, provider.missing(room.frames)) == (False, [])
     for frame in room.frames[::3]:
         truth = room.views[frame.id].depth * UNIT
@@ -83,7 +83,7 @@ def test_frames_with_few_points_lean_on_their_neighbours_and_no_pose_is_unknown(
     network: Any = Relative(room, "scale")
     network.scales[:] = 2.0
     provider = AlignedDepth(network, replace(sequence, backbone=thin), "scale")
-    provider.prepare(room.frames)
+    provider.fit(room.frames)
     truth: NDArray[np.float32] = room.views[5].depth * np.float32(UNIT)
     error = np.abs(provider.estimate(room.frames[5]).depth / np.maximum(truth, 1e-6) - 1)[truth > 0]
     assert np.median(error) < 0.01

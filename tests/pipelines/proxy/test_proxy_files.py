@@ -39,7 +39,7 @@ def depth_files(source: Path, room: Room, folder: str = "", unit: float = 0.001)
 def label_files(source: Path, room: Room) -> FilesLabels:
     provider = FilesLabels("", source, room.sequence(), SilentProgress())
     empty = DepthEstimate(np.zeros((1, 1), np.float32), np.zeros((1, 1), np.float32))
-    provider.prepare(room.frames, lambda frame: empty)
+    provider.fit(room.frames, lambda frame: empty)
     return provider
 
 
@@ -262,7 +262,7 @@ def test_a_real_data_set_is_understood(
     stored = cv2.imread(str(shared_data / folder / "depth" / f"{Path(frames[5].name).stem}.png"), -1)
     np.testing.assert_allclose(depth.depth, stored / 1000, rtol=1e-6)
     labels = FilesLabels("", source, sequence, SilentProgress())
-    labels.prepare(frames, lambda f: depth)
+    labels.fit(frames, lambda f: depth)
     assert len(labels.classes()) == classes
     assert {"wall", "sofa", "tv-screen"} <= set(labels.classes().names)
     assert labels.warnings() == []

@@ -29,7 +29,7 @@ SIDE, PLANES = 256, 64
 def stereo(room: Room, tmp_path_factory: pytest.TempPathFactory) -> MultiviewDepth:
     folder = tmp_path_factory.mktemp("stereo")
     provider = MultiviewDepth(room.sequence(), SIDE, PLANES, lambda: folder, 2, SilentProgress())
-    provider.prepare(room.frames)
+    provider.fit(room.frames)
     return provider
 
 
@@ -67,9 +67,9 @@ def test_the_range_of_depths_holds_what_is_plain_and_nearer_than_all_points(room
 
 def test_multiview_gives_the_same_bytes_with_other_threads(room: Room, stereo: MultiviewDepth, tmp_path: Path) -> None:
     single = MultiviewDepth(room.sequence(), SIDE, PLANES, lambda: tmp_path, 1, SilentProgress())
-    single.prepare(room.frames[4:6])
+    single.fit(room.frames[4:6])
     few = MultiviewDepth(room.sequence(), SIDE, PLANES, lambda: tmp_path, 3, SilentProgress())
-    few.prepare(room.frames[6:8])
+    few.fit(room.frames[6:8])
     for frame in room.frames[4:8]:
         ours, theirs = (p._path(frame.id).read_bytes() for p in (few, stereo))
         assert ours == theirs
@@ -104,7 +104,7 @@ class Learned:
     def missing(self, frames: list[Frame]) -> list[Frame]:
         return []
 
-    def prepare(self, frames: list[Frame]) -> None:
+    def fit(self, frames: list[Frame]) -> None:
         pass
 
     def estimate(self, frame: Frame) -> DepthEstimate:
@@ -121,7 +121,7 @@ class Learned:
 def test_fused_depth_is_metric_and_better_than_either(room: Room, stereo: MultiviewDepth) -> None:
     learned = Learned(room)
     fused = FusedDepth(learned, stereo, room.sequence())
-    fused.prepare(room.frames)
+    fused.fit(room.frames)
     assert fused.metric
     scale = measure_scale(room.sequence(), room.frames, fused.estimate).value * UNIT
     assert scale == pytest.approx(1, abs=0.03)
@@ -189,7 +189,7 @@ def test_regions_mean_the_same_in_all_frames_and_know_the_floor(room: Room) -> N
     }
     sequence = room.sequence()
     segments = SegmentLabels(sequence, 16, SilentProgress())
-    segments.prepare(room.frames, lambda frame: truth[frame.id])
+    segments.fit(room.frames, lambda frame: truth[frame.id])
     names = segments.classes().names
     assert {"floor", "wall"} <= set(names)
     assert 4 <= len(names) <= 16

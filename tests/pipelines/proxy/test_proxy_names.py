@@ -107,7 +107,7 @@ def test_a_room_of_which_nothing_is_sure_has_the_names_of_each_frame_alone(room:
     found = scene.estimate(room.sequence(), room.frames[0], scattered(room.frames[0]), said[0])
     names = np.array([*scene.names, "void"])[np.minimum(found.labels, len(scene.names))]
     assert (names == np.array(NAMES)[room.views[0].labels]).mean() > 0.5
-    segments.prepare(room.frames, scattered)
+    segments.fit(room.frames, scattered)
     alone = segments.estimate(room.frames[0], scattered(room.frames[0]))
     assert len(segments.classes()) == 0
     assert (alone.labels == VOID).all()

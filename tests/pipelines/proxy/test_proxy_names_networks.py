@@ -69,7 +69,7 @@ def test_frames_of_a_stand_in_name_the_made_room_together(room: Room, tmp_path: 
     card = Card("segmentation", file, "image", "scores", 1.0, (0.5,) * 3, (0.5,) * 3, kind="logits", classes=KINDS)
     sequence = replace(room.sequence(), read_image=lambda frame: pictures[frame.id])
     found = provider(card, sequence, tmp_path / "work")
-    found.prepare(room.frames, lambda f: depth_of(room, f))
+    found.fit(room.frames, lambda f: depth_of(room, f))
     confusion = np.zeros((2, 3, 4), np.int64)
     for frame in room.frames:
         shown = in_order_of(KINDS, found, found.estimate(frame, depth_of(room, frame)).labels)
@@ -105,7 +105,7 @@ def test_frames_of_the_real_network_name_a_room_better_together(shared_data: Pat
         return DepthEstimate(small, (small > 0).astype(np.float32) * 0.8)
 
     found = provider(card, sequence, tmp_path / "work")
-    found.prepare(frames, depth)
+    found.fit(frames, depth)
     truth = open_sequence(room)
     names = tuple(dict.fromkeys((*card.labels, *found.classes().names)))
     matching = match_classes(names, card.labels, truth.class_names, None)

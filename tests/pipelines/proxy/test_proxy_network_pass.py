@@ -150,7 +150,7 @@ def test_without_a_head_alike_features_are_a_class(room: Room, tmp_path: Path) -
         depth = (room.views[frame.id].depth * 0.5).astype(np.float32)
         return DepthEstimate(depth, np.ones_like(depth))
 
-    provider.prepare(room.frames, depth_of)
+    provider.fit(room.frames, depth_of)
     assert provider.classes().names == ("cluster 1", "cluster 2", "cluster 3")
     frame = room.frames[4]
     found = provider.estimate(frame, depth_of(frame))

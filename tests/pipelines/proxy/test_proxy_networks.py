@@ -437,7 +437,7 @@ def test_the_point_map_family_comes_back_as_metres(tmp_path: Path) -> None:
     place = Workplace(sequence, lambda: tmp_path, 1, "cpu", SilentProgress(), ResultCache(tmp_path, 0))
     for _ in range(2):  # the second finds what the first, or a worker, has left
         provider = OnnxDepth(card, place)
-        provider.prepare(frames)
+        provider.fit(frames)
         assert provider.figures()["network_focal_px"] == round(found.focal, 1)
 
 

@@ -40,9 +40,9 @@ def run(oracle_run: OracleRun) -> RunFolder:
 def test_the_room_stands_upright_on_its_floor(run: RunFolder, truth: Sequence) -> None:
     outcome = load_outcome(run)
     found = find_upright(outcome)
-    assert found.told_by == "floor and upright lines"
+    assert found.source == "floor and upright lines"
     assert 0 < degrees(found.up, MOVE.rotation @ UP) < 1
-    assert max(found.against["upright lines"], found.against["floor"]) < 1
+    assert max(found.disagreement_deg["upright lines"], found.disagreement_deg["floor"]) < 1
     world = upright_world(outcome, found)
     exported_from_truth = world.exported_from_run @ MOVE
     assert abs(exported_from_truth.apply(np.zeros(3))[2]) < 0.03, "the floor of the room is at z = 0"
@@ -121,7 +121,7 @@ def test_first_axes_on_request(run: RunFolder) -> None:
 def test_world_file_round_trip(run: RunFolder) -> None:
     world = World("up", "floor", True, MOVE, {"cameras": 1.5})
     read = WORLD.read(WORLD.save(run.root, world))
-    assert (read.axes, read.told_by, read.has_floor, read.against) == ("up", "floor", True, {"cameras": 1.5})
+    assert (read.axes, read.source, read.has_floor, read.disagreement_deg) == ("up", "floor", True, {"cameras": 1.5})
     np.testing.assert_array_equal(read.exported_from_run.rotation, MOVE.rotation)
     assert run.find(WORLD) is None, "nothing is exported yet"
     (run.root / "world.json").write_text('{"axes": "up", "exported_from_run": 3}')
