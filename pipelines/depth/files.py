@@ -15,7 +15,7 @@ from ...formats.errors import InputError
 from ...formats.images import MAX_IMAGE_PIXELS, image_size, natural_key, read_depth_png, read_grey_png
 from ...formats.reading import home_expanded, parsing, reaching, require_file
 from ...formats.tensors import HEADERS
-from ..geometry.resampling import resample_nearest, resize_depth
+from ..geometry.camera import resample_nearest, resize_depth
 from ..providers import DepthEstimate, DepthProvider, Sequence
 from ..types import Frame, Intrinsics
 

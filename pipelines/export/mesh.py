@@ -15,9 +15,8 @@ from ..compute.threads import get_threads, host_threads
 from ..config import ExportConfig
 from ..engine.stages import StageContext
 from ..engine.tasks import Chunk
-from ..geometry.camera import project
+from ..geometry.camera import project, resample_nearest
 from ..geometry.posed_depth import PosedDepth
-from ..geometry.resampling import resample_nearest
 from ..mapping.measure import DrawnView, Shown, drawn_view
 from ..outcome import Outcome, load_outcome, maps_around
 from ..system.lru_sequence import LruSequence

@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.camera import unproject_depth
+from ..geometry.camera import resample_nearest, unproject_depth
 from ..geometry.posed_depth import PosedDepth
-from ..geometry.resampling import resample_nearest
 from ..geometry.voxels import VOXELS_PER_DEPTH, Voxels, find, gather_depths, neighbour_keys, normals_in_cam, voxel_keys
 from ..mapping.measure import DrawnView
 from ..outcome import evenly

@@ -10,11 +10,13 @@ import pycolmap
 
 from ...formats.reconstruction import pose_of
 from ..engine.stages import StageContext
+from ..geometry.sparse_model import SparseModel
+from ..run.before import Before
 from ..sfm.candidates import GIVEN, GIVEN_ALONE
 from ..sfm.driver import Structure
 from ..sfm.given import agreement
 from ..system.wording import stretches
-from ..types import GivenPoses
+from ..types import Frame, GivenPoses
 
 _LEAST_PART = 3
 
@@ -110,3 +112,11 @@ def warn_of_given(
         "given_degrees_sd": round(agreed.degrees_sd, 4),
         "given_wrong": wrong,
     }
+
+
+def in_world_of(before: Before, model: SparseModel, frames: Sequence[Frame]) -> SparseModel:
+    """The model moved, turned and scaled to where its keyframes were before; as it is where none tells that."""
+    poses = before.poses_of([frames[i] for i in model.frame_ids.tolist()])
+    known = np.isfinite(poses).all(axis=(1, 2))
+    agreed = agreement(model.cam_from_world[known], poses[known])
+    return model if agreed is None else model.moved(agreed.move)

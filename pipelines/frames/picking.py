@@ -12,8 +12,7 @@ from ...formats.video import VideoFrame
 from ..config import FramesConfig
 from ..engine.stages import StageContext
 from ..source.faces import Faces
-from ..source.pick import sharpest_of_windows
-from ..source.sharpness import reduce_image
+from ..source.sharpness import reduce_image, sharpest_of_windows
 from ..types import Frame
 from .tasks import AnySource, picked
 

@@ -48,8 +48,7 @@ from ..source.opening import FolderSource, Source, Warn, open_source
 from ..source.sharpness import reduce_image
 from ..system.parallel import parallel_map
 from ..types import Calibration, Frame, GivenPoses
-from .extending import in_world_of
-from .findings import settled_origin, warn_of_given, warn_of_structure
+from .findings import in_world_of, settled_origin, warn_of_given, warn_of_structure
 from .keyframes import KeyframeChoice, choose_keyframes
 from .learned import learned_inputs, open_learned
 from .masks import FrameMasks, check_masks, mask_inputs

@@ -37,8 +37,7 @@ from ..system.lru_sequence import LruSequence
 from ..system.values import load_value, save_value
 from ..tracking.adjust import align_depths, without_dependent_depth
 from ..tracking.pictures import Pictures, load_shutter
-from ..tracking.result import to_sparse_model
-from ..tracking.state import FEATURE_SD, TrackState
+from ..tracking.state import FEATURE_SD, TrackState, to_sparse_model
 from ..types import VOID, Intrinsics, Trajectory
 from .candidates import LabelSummary, loop_candidates, summarise_labels
 from .close import Closed, close_loops

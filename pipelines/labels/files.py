@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...formats.errors import InputError
 from ...formats.images import read_label_png
 from ..depth.files import as_read, find_folder, match_files, require_aspect
-from ..geometry.resampling import resample_nearest
+from ..geometry.camera import resample_nearest
 from ..networks.card import MAX_ID, NamedClass, find_class_table, read_class_table
 from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, Sequence, class_colors
 from ..system.progress import Progress

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from ..geometry.camera import unproject_depth
-from ..geometry.resampling import resample_nearest
+from ..geometry.camera import resample_nearest, unproject_depth
 from ..geometry.room_layout import FLOOR, Gravity
 from ..geometry.voxels import Voxels, find, find_near, select, touching, voxel_keys
 from ..providers import DepthEstimate, LabelEstimate, Sequence, resample_linear

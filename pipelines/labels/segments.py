@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ..depth.stereo.fill import spread_in_place
-from ..geometry.camera import unproject_depth
-from ..geometry.resampling import resample_nearest
+from ..geometry.camera import resample_nearest, unproject_depth
 from ..geometry.room_layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
 from ..geometry.voxels import LEAST_WEIGHT, VOXELS_PER_DEPTH, Voxels, find_near, gather_frame, merge, select, voxel_keys
 from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, Sequence, class_colors

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..geometry.camera import resize_depth, resize_maps
 from ..geometry.posed_depth import PosedDepth
-from ..geometry.resampling import resize_depth, resize_maps
 from ..types import VOID, Intrinsics, ProxyMaps
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..depth.scale import DepthScale
 from ..engine.stages import StageContext
 from ..engine.tasks import Chunk, in_chunks
-from ..geometry.resampling import resample_nearest
+from ..geometry.camera import resample_nearest
 from ..geometry.voxels import to_lab
 from ..masks.moving import SIDE, MovingView, look_once
 from ..providers import (

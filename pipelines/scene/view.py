@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.camera import unproject_depth
-from ..geometry.resampling import resize_maps
+from ..geometry.camera import resize_maps, unproject_depth
 from ..geometry.room_layout import CEILING, FLOOR, FloorPlane, Gravity, find_gravity, floor_plane, name_structure
 from ..geometry.voxels import LEAST_WEIGHT, VOXELS_PER_DEPTH, Voxels, find, gather_frame, merge, voxel_keys
 from ..providers import resize_area

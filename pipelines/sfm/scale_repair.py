@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from ...formats.reconstruction import pose_of, set_pose
 from .adjust import filter_outliers, solve
 from .consistency import ModelReport, judge
+from .given import complete_tracks
 from .matching import VerifiedPair
 from .seams import LEAST_POINTS, parts_of, tracks_of
-from .tracks import complete_tracks
 
 _LEAST_ANGLE = 0.01
 """Radians between the rays of two cameras below which they give no depth."""

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from ...formats.video import VideoFrame
+
+_TIME_SLACK = 1e-6
+"""Seconds: a frame due exactly at a window's start must not fall into the window before by rounding."""
 
 _MEASURED_SIDE = 480
 """Sharpness is measured at this long side: sensor noise is averaged away, and all sources are alike."""
@@ -39,3 +46,29 @@ def reduce_image(image: NDArray[np.uint8], max_side: int) -> NDArray[np.uint8]:
     if size == (width, height):
         return image
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+
+
+def sharpest_of_windows(
+    pictures: Iterable[VideoFrame],
+    rate: float,
+    measure: Callable[[NDArray[np.uint8]], float] = sharpness,
+) -> Iterator[tuple[VideoFrame, float]]:
+    """The sharpest image of every 1/rate seconds, with its sharpness; rate 0 keeps all.
+
+    One pass that holds one image. Windows lie on the source's clock from its first image, so a variable frame
+    rate gives an even rate of frames.
+    """
+    best: tuple[VideoFrame, float] | None = None
+    window, start = 0, None
+    for picture in pictures:
+        start = picture.timestamp if start is None else start
+        here = int((picture.timestamp - start + _TIME_SLACK) * rate)
+        if best is not None and (rate <= 0 or here != window):
+            yield best
+            best = None
+        window = here
+        score = measure(picture.rgb)
+        if best is None or score > best[1]:
+            best = (picture, score)
+    if best is not None:
+        yield best

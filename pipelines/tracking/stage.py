@@ -26,10 +26,9 @@ from ..types import Frame
 from .adjust import Report, adjust_state, align_depths, without_dependent_depth
 from .front_end import FrontEnd
 from .pictures import Pictures, load_shutter
-from .result import split_worlds, to_sparse_model, to_trajectory
 from .rotation_only import set_rotation_only_poses
 from .segments import carry_given, join_segments, split_segments
-from .state import FEATURE_SD, TrackState, sync_rig_poses
+from .state import FEATURE_SD, TrackState, split_worlds, sync_rig_poses, to_sparse_model, to_trajectory
 
 SNAPSHOT_EVERY, SNAPSHOTS = 50, 20
 """Frames between two; of a long recording no more are taken in all, since each holds all that is known so far."""

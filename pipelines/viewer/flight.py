@@ -11,8 +11,7 @@ import numpy as np
 
 from ..system.wording import quoted
 from .camera_path import CameraPath, Keyframe
-from .scene import ViewerScene
-from .views import client_view, move_client, shown_pose
+from .scene import ViewerScene, client_view, move_client, shown_pose
 
 _GREEN = (22, 163, 74)
 _PREVIEW_FPS, _LINE_FPS = 25.0, 8.0

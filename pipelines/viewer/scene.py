@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,6 +28,8 @@ from ..scene.upright import cameras_up
 from ..scene.world import WORLD, up_in_run
 from ..types import Frame, Intrinsics, Metres
 from .camera_path import EXPORTED, RUN
+
+Array = NDArray[np.float64]
 
 MODES = ("colour", "classes", "depth")
 MOST_CAMERAS = 60
@@ -241,3 +244,25 @@ def _scale(means: NDArray, centers: NDArray) -> float:
     points = np.concatenate([means.astype(np.float64), centers])
     low, high = np.quantile(points, (0.05, 0.95), axis=0)
     return _USUAL_SIZE / max(float((high - low).max()), 1e-9)
+
+
+def client_view(client: Any) -> Array:
+    """(4, 4) pose of a client's camera as shown, x right, y down, z forward: viser's convention is ours."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(np.asarray(client.camera.wxyz)[[1, 2, 3, 0]]).as_matrix()
+    pose[:3, 3] = client.camera.position
+    return pose
+
+
+def shown_pose(world_from_cam: Array, scale: float) -> tuple[Array, Array]:
+    """(wxyz, position) as shown of a pose (4, 4) in the scene's world."""
+    quat_xyzw = Rotation.from_matrix(world_from_cam[:3, :3]).as_quat()
+    return quat_xyzw[[3, 0, 1, 2]], world_from_cam[:3, 3] * scale
+
+
+def move_client(client: Any, world_from_cam: Array, scale: float, fov: float) -> None:
+    """Let a client look from a pose (4, 4) in the scene's world; fov: vertical, in radians."""
+    wxyz, position = shown_pose(world_from_cam, scale)
+    with client.atomic():
+        client.camera.wxyz, client.camera.position = wxyz, position
+        client.camera.fov = fov

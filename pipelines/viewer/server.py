@@ -20,9 +20,8 @@ from ..source.sharpness import at_most_wide
 from .door import guarding
 from .flight import Flight
 from .live import Watch
-from .scene import MODES, ViewerCamera, ViewerScene, load_scenes
+from .scene import MODES, ViewerCamera, ViewerScene, client_view, load_scenes, move_client, shown_pose
 from .tools import Selection, Tape, class_name, length_text, unit_text
-from .views import client_view, move_client, shown_pose
 
 _FRUSTUM = 0.09
 _PREVIEW_WIDTH = 480

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from ...formats.gaussian_ply import write_gaussian_ply
 from ..geometry.tape import Touch, area, area_text, tape, tape_text, touch
 from ..types import VOID
-from .scene import ViewerScene
-from .views import client_view
+from .scene import ViewerScene, client_view
 
 _SETTLE_SECONDS = 0.25
 """A slider is dragged through many values; the map is sent again once it rests."""

@@ -41,8 +41,7 @@ from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.evaluation.labels import ClassMap, Matching, count_labels, match_classes, read_class_map, score
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.evaluation.views import Picture, label_picture, render_outcome
-from msgs_slam.pipelines.geometry.camera import unproject_depth
-from msgs_slam.pipelines.geometry.resampling import resample_nearest
+from msgs_slam.pipelines.geometry.camera import resample_nearest, unproject_depth
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.providers import class_colors

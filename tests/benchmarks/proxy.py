@@ -36,8 +36,7 @@ from numpy.typing import NDArray
 from tracking import write_noisy_depth
 
 from msgs_slam.formats.images import natural_key, read_depth_png
-from msgs_slam.pipelines.geometry.camera import project, unproject_depth
-from msgs_slam.pipelines.geometry.resampling import resample_nearest
+from msgs_slam.pipelines.geometry.camera import project, resample_nearest, unproject_depth
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, CLASSES, FIGURES, FRAMES, PROXY_MAPS

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.evaluation.views import render_outcome
-from msgs_slam.pipelines.geometry.resampling import resample_nearest
+from msgs_slam.pipelines.geometry.camera import resample_nearest
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct

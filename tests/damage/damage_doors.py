@@ -61,7 +61,7 @@ from msgs_slam.formats.video import VideoReader, probe_video
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.depth.files import _read as read_depth_file
 from msgs_slam.pipelines.evaluation.labels import read_class_map
-from msgs_slam.pipelines.masks.files import open_masks
+from msgs_slam.pipelines.frames.masks import open_masks
 from msgs_slam.pipelines.networks.card import Card, read_card, read_class_table
 from msgs_slam.pipelines.networks.network_pass import ResultCache
 from msgs_slam.pipelines.networks.registry import ModelStore

@@ -33,16 +33,16 @@ from msgs_slam.pipelines.export.planes import find_planes
 from msgs_slam.pipelines.export.surface import chunk_surfaces, joined, weld
 from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
 from msgs_slam.pipelines.export.writers import seen_points
+from msgs_slam.pipelines.geometry.camera import resize_maps
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth, neighbours, overlaps
-from msgs_slam.pipelines.geometry.resampling import resize_maps
 from msgs_slam.pipelines.geometry.room_layout import Gravity, find_gravity, floor_plane, levels, name_structure
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.geometry.voxels import Voxels, find_near, gather_depths, touching, voxel_keys
 from msgs_slam.pipelines.mapping.exposure import fit_exposure
+from msgs_slam.pipelines.mapping.growth import with_region_prior
 from msgs_slam.pipelines.mapping.losses import depth_loss
 from msgs_slam.pipelines.mapping.measure import depth_view, drawn_view
 from msgs_slam.pipelines.mapping.optimise import voted_logits
-from msgs_slam.pipelines.mapping.region_prior import with_region_prior
 from msgs_slam.pipelines.mapping.seeding import complete_depth, fill_smoothly, seed_spacing
 from msgs_slam.pipelines.mapping.submaps import nearest_seeing
 from msgs_slam.pipelines.mapping.views import halved, make_view, occurring_classes

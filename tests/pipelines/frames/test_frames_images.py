@@ -11,8 +11,7 @@ from PIL import Image
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
-from msgs_slam.pipelines.frames.masks import FrameMasks
-from msgs_slam.pipelines.masks.files import open_masks
+from msgs_slam.pipelines.frames.masks import FrameMasks, open_masks
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.types import Frame

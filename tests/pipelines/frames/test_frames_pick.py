@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msgs_slam.formats.video import VideoFrame
-from msgs_slam.pipelines.source.pick import sharpest_of_windows
-from msgs_slam.pipelines.source.sharpness import reduce_image, reduced_size, sharpness
+from msgs_slam.pipelines.source.sharpness import reduce_image, reduced_size, sharpest_of_windows, sharpness
 
 BLANK = np.zeros((2, 2, 3), np.uint8)
 

@@ -11,7 +11,7 @@ import torch
 
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.resampling import resize_depth
+from msgs_slam.pipelines.geometry.camera import resize_depth
 from msgs_slam.pipelines.mapping import extending
 from msgs_slam.pipelines.mapping.load import MappingInput, load_views, split_frames
 from msgs_slam.pipelines.mapping.move_map import interpolate_rows, move_trajectory

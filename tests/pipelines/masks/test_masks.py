@@ -16,10 +16,9 @@ from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.depth.stereo.sweep import sweep_cost
 from msgs_slam.pipelines.depth.stereo.volume import Bands
 from msgs_slam.pipelines.frames.keyframes import choose_keyframes
-from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs
+from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs, open_masks
 from msgs_slam.pipelines.mapping.objective import Objective
 from msgs_slam.pipelines.mapping.views import View, make_view
-from msgs_slam.pipelines.masks.files import open_masks
 from msgs_slam.pipelines.masks.people import PeopleFinder, join_people, people_cards
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.providers import DepthEstimate, LabelEstimate

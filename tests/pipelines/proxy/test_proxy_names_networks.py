@@ -12,7 +12,7 @@ from tiny_tflite import write_tflite
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.images import read_depth_png, read_rgb
 from msgs_slam.pipelines.evaluation.labels import count_labels, match_classes, score
-from msgs_slam.pipelines.geometry.resampling import resample_nearest
+from msgs_slam.pipelines.geometry.camera import resample_nearest
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.labels.learned import OnnxLabels
 from msgs_slam.pipelines.networks.card import Card
