@@ -76,20 +76,6 @@ class Volume(NamedTuple):
         firsts = (ends - TILE * TILE * strides)[..., None] + BLOCK * (there.cumsum(2) - 1)
         return Volume(height, width, planes, np.empty(ends[-1, -1], np.float32), np.where(there, firsts, -1), strides)
 
-    @staticmethod
-    def of_dense(cost: NDArray[np.float32]) -> Volume:
-        """All of (H, W, D)."""
-        height, width, planes = cost.shape
-        volume = Volume.of_tried(height, width, np.ones((*tiles_of(height, width), planes), np.bool_))
-        _copy(volume.values, volume.places, volume.strides, cost, True)
-        return volume
-
-    def dense(self) -> NDArray[np.float32]:
-        """(H, W, D), UNREACHED where no plane is tried."""
-        out = np.full((self.height, self.width, self.planes), UNREACHED)
-        _copy(self.values, self.places, self.strides, out, False)
-        return np.minimum(out, UNREACHED)
-
     def zeros(self) -> Volume:
         """Another of the same shape, of zeros."""
         return self._replace(values=np.zeros_like(self.values))
@@ -99,30 +85,6 @@ class Volume(NamedTuple):
 def pixel_of_tile(y: int, x: int) -> int:
     """Return the number of a pixel in its tile."""
     return y % TILE * TILE + x % TILE
-
-
-@kernel
-def _copy(
-    values: NDArray[np.float32],
-    places: NDArray[np.int64],
-    strides: NDArray[np.int64],
-    dense: NDArray[np.float32],
-    inwards: bool,
-) -> None:
-    height, width, planes = dense.shape
-    for y in range(height):
-        for x in range(width):
-            pixel = pixel_of_tile(y, x) * strides[y // TILE, x // TILE]
-            for b in range(places.shape[2]):
-                place = places[y // TILE, x // TILE, b]
-                if place < 0:
-                    continue
-                for d in range(BLOCK):
-                    plane = b * BLOCK + d
-                    if inwards:
-                        values[place + pixel + d] = dense[y, x, plane] if plane < planes else UNREACHED
-                    elif plane < planes:
-                        dense[y, x, plane] = values[place + pixel + d]
 
 
 def least_planes(volume: Volume) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

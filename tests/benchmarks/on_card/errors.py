@@ -15,7 +15,7 @@ from msgs_slam.pipelines.depth.stereo import card
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.depth.stereo.smoothing import smooth_cost
 from msgs_slam.pipelines.depth.stereo.sweep import refine_inverse_depth, sweep_cost
-from msgs_slam.pipelines.depth.stereo.volume import Bands, Volume
+from msgs_slam.pipelines.depth.stereo.volume import Bands
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure
 from msgs_slam.pipelines.mapping.objective import Objective, color_errors_on_card, fit_exposure_on_card
@@ -24,6 +24,7 @@ from msgs_slam.pipelines.render import reference
 from msgs_slam.pipelines.render.api import Rendering, composite, in_view, project_map, render
 from on_card.rows import Rows
 from on_card.scenes import CARD, CPU, SIZES, StereoScene, mapper, step, stereo_scene, there, world_of
+from tests.dense_volumes import of_dense, to_dense
 
 POSE = se3.exp(torch.tensor([0.03, -0.02, 0.04, 0.01, -0.02, 0.005], dtype=torch.float64))
 RELATIVE, FAR, SHARE = 1e-3, 1e-3, 0.02
@@ -212,10 +213,10 @@ def errors_of_stereo(rows: Rows) -> None:
 def _stereo_steps(rows: Rows, scene: StereoScene, bands: Bands) -> None:
     on_card, best = card.Matching.of(scene.images, CARD.device), matching.best_count(len(scene.images.others))
     cost = on_card.cost(scene.planes)
-    exact = sweep_cost(*scene.images, scene.planes, best, bands).dense()
+    exact = to_dense(sweep_cost(*scene.images, scene.planes, best, bands))
     agree(rows, "stereo", "costs", cost, exact, pixels=True)
-    dense = Volume.of_dense(exact)
-    smooth = smooth_cost(dense, scene.images.image, matching.SMALL_STEP, matching.JUMP, matching.EDGE, bands).dense()
+    dense = of_dense(exact)
+    smooth = to_dense(smooth_cost(dense, scene.images.image, matching.SMALL_STEP, matching.JUMP, matching.EDGE, bands))
     ours = on_card.smoothed(torch.from_numpy(exact).to(CARD.device), matching.SMALL_STEP)
     agree(rows, "stereo", "smoothed", ours, smooth, pixels=True)
     inverse = (1 / scene.depth + 0.005 * np.random.default_rng(2).standard_normal(scene.depth.shape)).astype(np.float32)

@@ -29,6 +29,7 @@ from msgs_slam.pipelines.sfm.flow import corners
 from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame, Intrinsics
+from tests.dense_volumes import to_dense
 from tests.pipelines.proxy.tiny_tflite import write_tflite
 
 HEIGHT, WIDTH = 96, 128
@@ -131,11 +132,11 @@ def test_stereo_compares_no_window_that_touches_what_another_view_leaves_out() -
     blanked = np.where(left_half(), np.float32(np.nan), np.roll(grey, -8, 1))
     shift = np.array([[[1.0, 0, 0, -8], [0, 1, 0, 0], [0, 0, 1, 0]]])  # 8 pixels at the inverse depth 1
     planes, bands = np.array([0.25, 1.0]), Bands(1)
-    cost = sweep_cost(grey, blanked[None], shift, planes, 1, bands).dense()
+    cost = to_dense(sweep_cost(grey, blanked[None], shift, planes, 1, bands))
     assert (cost[:, : 64 - 8, 0] == 1).all()  # no view sees it: as good as any other depth
     assert np.median(cost[10:-10, 84:110, 1]) < 0.05 < 0.4 < np.median(cost[10:-10, 84:110, 0])
     assert np.isfinite(cost).all()
-    whole = sweep_cost(grey, np.stack([blanked, np.roll(grey, -8, 1)]), shift.repeat(2, 0), planes, 1, bands).dense()
+    whole = to_dense(sweep_cost(grey, np.stack([blanked, np.roll(grey, -8, 1)]), shift.repeat(2, 0), planes, 1, bands))
     assert np.median(whole[10:-10, 30:110, 1]) < 0.05  # another view does
 
 

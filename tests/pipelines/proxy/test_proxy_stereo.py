@@ -27,8 +27,9 @@ from msgs_slam.pipelines.depth.stereo.provider import at_stops
 from msgs_slam.pipelines.depth.stereo.smoothing import smooth_cost
 from msgs_slam.pipelines.depth.stereo.sweep import refine_inverse_depth, sweep_cost, warps_to
 from msgs_slam.pipelines.depth.stereo.upsample import upsample_depth
-from msgs_slam.pipelines.depth.stereo.volume import TILE, UNREACHED, Bands, Volume, least_planes, pick_planes, tiles_of
+from msgs_slam.pipelines.depth.stereo.volume import TILE, UNREACHED, Bands, least_planes, pick_planes, tiles_of
 from msgs_slam.pipelines.depth.stereo.window import LIKENESS, RADIUS, STEP, VARIANCE_FLOOR, surface_contrast
+from tests.dense_volumes import of_dense, to_dense
 
 HEIGHT, WIDTH, FOCAL = 40, 60, 50.0
 MATRIX = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
@@ -85,7 +86,7 @@ def slow_score(image: NDArray, other: NDArray, warp: NDArray, inverse: float, y:
 def test_sweep_is_the_correlation_written_out() -> None:
     image, others, warps, _ = scene(0.3)
     planes = np.linspace(1 / 3, 1 / 1.4, 7)
-    cost = sweep_cost(image, others, warps, planes, 2, Bands(1)).dense()
+    cost = to_dense(sweep_cost(image, others, warps, planes, 2, Bands(1)))
     for y, x, d in ((15, 25, 1), (20, 30, 3), (24, 36, 6)):
         scores = sorted(slow_score(image, o, w, planes[d], y, x) for o, w in zip(others, warps, strict=True))
         assert cost[y, x, d] == pytest.approx(1 - np.mean(scores[-2:]), abs=2e-4)
@@ -102,15 +103,15 @@ def test_only_planes_that_are_tried_are_compared_and_searched() -> None:
         tried[tile][first : first + rng.integers(2, 8)] = True
         tried[tile][first] = True
     pixels = tried.repeat(TILE, 0)[:HEIGHT].repeat(TILE, 1)[:, :WIDTH]
-    whole = sweep_cost(image, others, warps, planes, 2, Bands(1)).dense()
+    whole = to_dense(sweep_cost(image, others, warps, planes, 2, Bands(1)))
     cost = sweep_cost(image, others, warps, planes, 2, Bands(1), tried)
-    np.testing.assert_array_equal(cost.dense(), np.where(pixels, whole, UNREACHED))
+    np.testing.assert_array_equal(to_dense(cost), np.where(pixels, whole, UNREACHED))
     assert cost.values.size < np.prod((*tiles_of(HEIGHT, WIDTH), TILE, TILE, 32))
     total = smooth_cost(cost, image, 0.1, 1.2, 0.05, Bands(1))
-    far_off = Volume.of_dense(np.where(pixels, whole, np.float32(1e5)))
-    expected = smooth_cost(far_off, image, 0.1, 1.2, 0.05, Bands(1)).dense()
-    np.testing.assert_array_equal(total.dense()[pixels], expected[pixels])
-    assert (total.dense()[~pixels] == UNREACHED).all()
+    far_off = of_dense(np.where(pixels, whole, np.float32(1e5)))
+    expected = to_dense(smooth_cost(far_off, image, 0.1, 1.2, 0.05, Bands(1)))
+    np.testing.assert_array_equal(to_dense(total)[pixels], expected[pixels])
+    assert (to_dense(total)[~pixels] == UNREACHED).all()
     picked = np.round(pick_planes(total)).astype(np.int64)
     assert np.take_along_axis(pixels, picked[..., None], 2).mean() > 0.9
 
@@ -157,10 +158,10 @@ def test_views_that_do_not_see_the_point_do_not_count() -> None:
     behind = warps.copy()
     behind[:, 2] *= -1
     planes = np.linspace(0.3, 0.6, 5)
-    assert (sweep_cost(image, others, behind, planes, 3, Bands(1)).dense() == 1).all()
+    assert (to_dense(sweep_cost(image, others, behind, planes, 3, Bands(1))) == 1).all()
     mixed = np.concatenate([warps[:2], behind[2:]])
-    alone = sweep_cost(image, others[:2], warps[:2], planes, 3, Bands(1)).dense()
-    np.testing.assert_array_equal(sweep_cost(image, others, mixed, planes, 3, Bands(1)).dense(), alone)
+    alone = to_dense(sweep_cost(image, others[:2], warps[:2], planes, 3, Bands(1)))
+    np.testing.assert_array_equal(to_dense(sweep_cost(image, others, mixed, planes, 3, Bands(1))), alone)
 
 
 def board_before_wall(cam_from_world: NDArray) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -177,9 +178,9 @@ def board_before_wall(cam_from_world: NDArray) -> tuple[NDArray[np.float32], NDA
 def test_windows_that_touch_what_is_no_scene_are_not_compared() -> None:
     image, others, warps, _ = scene(0.3)
     planes = np.linspace(1 / 3, 1 / 1.4, 7)
-    alone = sweep_cost(image, others[1:], warps[1:], planes, 2, Bands(1)).dense()
+    alone = to_dense(sweep_cost(image, others[1:], warps[1:], planes, 2, Bands(1)))
     others[0] = np.nan
-    assert np.array_equal(sweep_cost(image, others, warps, planes, 2, Bands(1)).dense(), alone)
+    assert np.array_equal(to_dense(sweep_cost(image, others, warps, planes, 2, Bands(1))), alone)
 
 
 def test_objects_do_not_grow_into_what_lies_behind_them() -> None:
@@ -225,7 +226,7 @@ def test_bytes_do_not_depend_on_the_threads() -> None:
         total = smooth_cost(cost, image, 0.05, 0.4, 0.05, Bands(threads))
         start = (planes[0] + pick_planes(total) * 0.05).astype(np.float32)
         fine = refine_inverse_depth(image, others, warps, start, 0.01, 2, 0.01, 2, Bands(threads))
-        results.append(total.dense().tobytes() + fine.tobytes())
+        results.append(to_dense(total).tobytes() + fine.tobytes())
     assert results[0] == results[1] == results[2]
 
 
@@ -258,7 +259,7 @@ def test_smoothing_sums_the_paths_written_out() -> None:
             expected += path.transpose(1, 0, 2) if turn else path
     for dy, dx in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         expected += slow_diagonal(cost, image, dy, dx)
-    found = smooth_cost(Volume.of_dense(cost), image, 0.1, 0.5, 0.2, Bands(2)).dense()
+    found = to_dense(smooth_cost(of_dense(cost), image, 0.1, 0.5, 0.2, Bands(2)))
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 

@@ -28,10 +28,10 @@ from msgs_slam.pipelines.depth.stereo.volume import (  # noqa: E402
     TILE,
     UNREACHED,
     Bands,
-    Volume,
     pick_planes,
 )
 from tests.card_builds import build  # noqa: E402
+from tests.dense_volumes import of_dense, to_dense  # noqa: E402
 
 DEVICE = "cuda" if ON_CARD else "cpu"
 PLANES = np.linspace(1 / 4, 1 / 1.2, 19)
@@ -55,7 +55,7 @@ def on_card(pictures: tuple[np.ndarray, np.ndarray, np.ndarray]) -> card.Matchin
 
 def test_the_sweep_has_the_costs_of_the_cpu(pictures: tuple, on_card: card.Matching) -> None:
     found = on_card.cost(PLANES).cpu().numpy()
-    expected = sweep_cost(*pictures, PLANES, matching.best_count(len(pictures[1])), BANDS).dense()
+    expected = to_dense(sweep_cost(*pictures, PLANES, matching.best_count(len(pictures[1])), BANDS))
     assert found.shape == expected.shape
     assert expected.std() > 0.1
     # Where the rim of a view, or of what is no scene, runs through a pixel, rounding decides whether it is seen.
@@ -65,8 +65,8 @@ def test_the_sweep_has_the_costs_of_the_cpu(pictures: tuple, on_card: card.Match
 def test_paths_are_smoothed_as_on_the_cpu(pictures: tuple, on_card: card.Matching) -> None:
     cost = np.random.default_rng(1).random((*pictures[0].shape, 19)).astype(np.float32)
     found = on_card.smoothed(torch.from_numpy(cost).to(DEVICE), matching.SMALL_STEP).cpu().numpy()
-    dense = Volume.of_dense(cost)
-    expected = smooth_cost(dense, pictures[0], matching.SMALL_STEP, matching.JUMP, matching.EDGE, BANDS).dense()
+    dense = of_dense(cost)
+    expected = to_dense(smooth_cost(dense, pictures[0], matching.SMALL_STEP, matching.JUMP, matching.EDGE, BANDS))
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
@@ -75,13 +75,13 @@ def test_planes_that_are_not_tried_are_left_out_as_on_the_cpu(pictures: tuple, o
     tried = np.zeros((1, 2, 19), np.bool_)
     tried[0, 0, [2, 3, 6]], tried[0, 1, 9:14] = True, True
     left = card.leave_out(torch.from_numpy(cost).to(DEVICE), tried)
-    there = Volume.of_dense(np.where(tried.repeat(TILE, 0)[:ROWS].repeat(TILE, 1)[:, :COLUMNS], cost, UNREACHED))
+    there = of_dense(np.where(tried.repeat(TILE, 0)[:ROWS].repeat(TILE, 1)[:, :COLUMNS], cost, UNREACHED))
     expected = smooth_cost(there, pictures[0], matching.SMALL_STEP, matching.JUMP, matching.EDGE, BANDS)
     found = on_card.picked(on_card.smoothed(left, matching.SMALL_STEP), PLANES).cpu().numpy()
     planes = PLANES[0] + pick_planes(expected) * (PLANES[1] - PLANES[0])
     np.testing.assert_allclose(found, planes, atol=1e-4)
-    assert (expected.dense()[:, :16, [*range(2), 4, 5, *range(7, 19)]] == UNREACHED).all()
-    assert (expected.dense()[:, :16, [2, 3, 6]] < UNREACHED).all()
+    assert (to_dense(expected)[:, :16, [*range(2), 4, 5, *range(7, 19)]] == UNREACHED).all()
+    assert (to_dense(expected)[:, :16, [2, 3, 6]] < UNREACHED).all()
 
 
 def test_the_refinement_and_the_filter_are_those_of_the_cpu(pictures: tuple, on_card: card.Matching) -> None:
