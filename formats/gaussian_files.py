@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from .errors import InputError
 from .gaussian_glb import read_gaussian_glb
-from .gaussian_ply import read_gaussian_ply
 from .gaussians import GaussianCloud, unit_quaternions
+from .ply import read_gaussian_ply
 from .reading import parsing, read_bytes
 from .spz import read_spz
 

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
-from .gaussian_ply import SH_C0
 from .gaussians import GaussianCloud, unit_quaternions
 from .glb import FLOAT, WIDTHS, Part, glb_parts, write_glb, write_primitive
+from .ply import SH_C0
 from .reading import parsing, read_bytes
 from .spz import read_spz_stream, spz_bytes
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .errors import InputError
 from .glb import Part, write_primitive
-from .ply_table import Rows, columns, read_ply, read_rows, write_ply
+from .ply import Rows, columns, read_ply, read_rows, write_ply
 from .reading import parsing
 from .trajectory import FARTHEST
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from .atomic import write_bytes
-from .gaussian_ply import SH_C0
 from .gaussians import GaussianCloud
+from .ply import SH_C0
 
 Array = NDArray[np.float64]
 

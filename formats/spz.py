@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from .atomic import write_bytes
 from .errors import InputError
-from .gaussian_ply import SH_C0
 from .gaussians import GaussianCloud, unit_quaternions
+from .ply import SH_C0
 from .reading import opened, parsing, require_file
 
 _MAGIC = b"NGSP"

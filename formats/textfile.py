@@ -1,16 +1,29 @@
-"""Small text files of numbers, read with a limit and with the line in the error."""
+"""Text files: rows of numbers, JSON and TOML, read with a limit and with the place of an error."""
 
 from __future__ import annotations
 
 import codecs
+import json
+import math
 import re
+import tomllib
 from pathlib import Path
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .atomic import write_text
 from .errors import InputError
-from .reading import read_bytes
+from .reading import parsing, read_bytes
+
+MAX_JSON_BYTES = 32 * 1024 * 1024
+MAX_TOML_BYTES = 1024 * 1024
+_MOST_DIGITS = 40
+_DEEPEST_KEY, _KEY_ENDS = 64, re.compile(r"[=\n,\[{]")
+_NO_KEY = re.compile(r"""#[^\n]*|\"{3}(?:[^\\]|\\.)*?\"{3}|'{3}.*?'{3}|"(?:[^"\\\n]|\\.)*"|'[^'\n]*'""", re.DOTALL)
+"""A comment or a string of TOML: dots in it divide no key."""
+_HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
 
 MAX_TEXT_BYTES = 48 * 1024 * 1024
 """150,000 poses of 16 numbers with all their digits. Taken apart into words, text needs twenty times its size."""
@@ -66,3 +79,79 @@ def read_table(path: Path, columns: int | None = None) -> NDArray[np.float64]:
         return np.array([row[:columns] for row in rows], dtype=np.float64)
     except ValueError as error:
         raise InputError(f"{path}: {str(error)[:200]}: every field must be a number") from error
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Atomically write indented JSON. Raises ValueError for NaN, InputError when the disk refuses."""
+    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+def read_json(path: Path, most: int | None = MAX_JSON_BYTES, *, allow_nan: bool = False) -> Any:
+    """Read a JSON file: numbers must be finite and of at most 40 digits, texts valid Unicode.
+
+    With `allow_nan` NaN and Infinity pass, which many programs write into poses they have lost.
+
+    Raises InputError when it is missing, larger than `most` bytes (None, for what a run holds: of any size), damaged,
+    or nested too deep.
+    """
+    text = read_text(path, most)
+    with parsing(path, "valid JSON", "was it cut short or edited by hand?"):
+        value = json.loads(
+            text, parse_constant=float if allow_nan else _refuse, parse_float=_finite, parse_int=_integer
+        )
+        if _HALF_CHARACTER.search(text):  # half of a pair cannot be written anywhere: neither in a path nor in a file
+            json.dumps(value, ensure_ascii=False).encode("utf-8")
+    return value
+
+
+def read_json_object(path: Path, most: int | None = MAX_JSON_BYTES, *, allow_nan: bool = False) -> dict[str, Any]:
+    """The object in a JSON file. Raises InputError as `read_json`, and when it holds something else."""
+    value = read_json(path, most, allow_nan=allow_nan)
+    if not isinstance(value, dict):
+        raise InputError(f"{path} holds a {type(value).__name__}, expected an object in braces")
+    return value
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The table in a TOML file. Raises InputError when it is missing, too large, damaged or nested too deep."""
+    text = read_text(path, MAX_TOML_BYTES)
+    with parsing(path, "valid TOML", "correct it"):
+        if any(part.count(".") > _DEEPEST_KEY for part in _KEY_ENDS.split(_NO_KEY.sub("", text))):
+            raise ValueError("a key of too many parts")  # tomllib takes the square of their number in time
+        return tomllib.loads(text)
+
+
+def _refuse(word: str) -> NoReturn:
+    raise ValueError(f"{word} is no number in JSON")
+
+
+def _finite(digits: str) -> float:
+    value = float(digits)
+    if not math.isfinite(value):
+        raise ValueError(f"the number {digits[:_MOST_DIGITS]} is too large")
+    return value
+
+
+def _integer(digits: str) -> int:
+    if len(digits) > _MOST_DIGITS:
+        raise ValueError(f"a number of {len(digits)} digits")
+    return int(digits)
+
+
+def number(table: dict[str, Any], path: Path, *names: str) -> float:
+    """The number under the first of these names that is there. Raises InputError when none is, or it is no number."""
+    value = optional_number(table, path, *names)
+    if value is None:
+        raise InputError(f"{path} lacks {' or '.join(repr(n) for n in names)}: add it")
+    return value
+
+
+def optional_number(table: dict[str, Any], path: Path, *names: str) -> float | None:
+    """Return the first number found under `names`, None without any. Raises InputError for other values."""
+    name = next((n for n in names if table.get(n) is not None), None)
+    if name is None:
+        return None
+    value = table[name]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{path}: {name!r} is {str(value)[:80]!r}, expected a number")
+    return float(value)

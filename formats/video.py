@@ -1,4 +1,4 @@
-"""Video files to RGB frames with their times, by OpenCV's FFmpeg."""
+"""Video files to RGB frames as they are to be shown, with their times, by OpenCV's FFmpeg."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import os
 import shlex
 import statistics
+import struct
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,14 +23,23 @@ os.environ.setdefault("OPENCV_VIDEOIO_DEBUG", "0")
 
 import cv2
 
-from .containers import as_opencv_writes_them
-from .display import Display, pixel_aspect, read_mirror
 from .errors import InputError
-from .hdr_video import AvCapture, hdr_transfer
 from .images import IMAGE_SUFFIXES
-from .interlaced import has_pyav, is_interlaced, unreadable
-from .reading import opened
-from .safe_path import require_unicode
+from .reading import opened, require_unicode
+from .video_streams import (
+    AvCapture,
+    as_opencv_writes_them,
+    has_pyav,
+    hdr_transfer,
+    is_interlaced,
+    read_moov,
+    unreadable,
+)
+
+_SQUARE = 0.002
+"""Sides that differ by less come from a size that was rounded to whole pixels."""
+_LONGEST_PIXEL = 5.0
+"""Length of a pixel's sides to each other; what is beyond is a damaged number."""
 
 MAX_FRAME_PIXELS = 64_000_000
 """A larger frame is taken for a damaged or hostile header (8K video has 33 million)."""
@@ -350,3 +360,60 @@ def _as_rgb8(decoded: NDArray) -> NDArray[np.uint8]:
         decoded = decoded >> 8
     to_rgb = cv2.COLOR_GRAY2RGB if decoded.ndim == 2 else cv2.COLOR_BGR2RGB
     return np.asarray(cv2.cvtColor(decoded.astype(np.uint8, copy=False), to_rgb), dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class Display:
+    """Steps that are left to do after the decoder's turn, in this order: swap the axes, mirror left to right (-1) and
+    top to bottom, and lengthen pixels: `aspect` is their width by their height as they are then, 1 for squares."""
+
+    swaps: bool = False
+    mirror: tuple[int, int] = (1, 1)
+    aspect: float = 1.0
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether the file asks for a mirrored picture, which no turn gives."""
+        return self.swaps or self.mirror != (1, 1)
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """Width and height in which a decoded frame of that size is shown; none becomes less."""
+        width, height = (height, width) if self.swaps else (width, height)
+        if self.aspect >= 1:
+            return round(width * self.aspect), height
+        return width, round(height / self.aspect)
+
+    def shown(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(H, W, ...) in the size that `size` says."""
+        size = self.size(image.shape[1], image.shape[0])
+        image = np.swapaxes(image, 0, 1) if self.swaps else image
+        image = np.ascontiguousarray(image[:: self.mirror[1], :: self.mirror[0]])
+        if size == (image.shape[1], image.shape[0]):
+            return image
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+
+
+def read_mirror(path: Path) -> Display:
+    """The Display of an MP4 or MOV whose track header (ISO/IEC 14496-12, 8.3.2) mirrors the picture; for all other
+    files, and where it only turns, which decoders do, one that leaves all as it is."""
+    for track in read_moov(path).split(b"trak")[1:]:
+        head = track.find(b"tkhd")
+        if head < 0 or b"vide" not in track:
+            continue
+        start = head + 4 + (52 if track[head + 4 : head + 5] == b"\1" else 40)
+        if len(track) < start + 20:
+            continue
+        a, b, _, c, d = struct.unpack(">5i", track[start : start + 20])  # x' = a x + c y, y' = b x + d y
+        if a * d - b * c < 0:
+            swaps = abs(a) < abs(b)
+            across, down = (c, b) if swaps else (a, d)
+            return Display(swaps, (1 if across > 0 else -1, 1 if down > 0 else -1))
+        return Display()
+    return Display()
+
+
+def pixel_aspect(wide: float, high: float) -> float:
+    """Width by height of a pixel; 1 where it is not said (0), damaged, or only rounding away from a square."""
+    aspect = wide / high if wide > 0 and high > 0 else 1.0
+    is_square = abs(aspect - 1) < _SQUARE or not 1 / _LONGEST_PIXEL <= aspect <= _LONGEST_PIXEL
+    return 1.0 if is_square else aspect

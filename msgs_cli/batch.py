@@ -93,7 +93,7 @@ def _reconstruct_one(
 ) -> NoReturn:  # fmt: skip
     """Do the recording that a placement has started this process for; the one that started it says what became of
     it."""
-    from ..formats.jsonfile import read_toml
+    from ..formats.textfile import read_toml
     from ..pipelines.batch import FAILED, Recording, reconstruct_one
     from ..pipelines.engine.placement import stop_with_parent
     from ..pipelines.system.progress import log

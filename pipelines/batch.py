@@ -16,7 +16,7 @@ from ..formats.atomic import own_temporaries, write_text
 from ..formats.datasets import looks_like_recording
 from ..formats.errors import InputError
 from ..formats.images import VIDEO_SUFFIXES
-from ..formats.jsonfile import write_json
+from ..formats.textfile import write_json
 from .config import Config
 from .engine.placement import Command, Placement
 from .read_config import load_config, merge_settings

@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from ..formats.errors import InputError, SettingError
-from ..formats.jsonfile import read_toml
-from ..formats.reading import home_expanded
-from ..formats.safe_path import is_unicode
+from ..formats.reading import home_expanded, is_unicode
+from ..formats.textfile import read_toml
 from .config import Config, allowed_values, range_text
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..formats.atomic import own_temporaries, temporary_of, write_text
 from ..formats.errors import InputError, RecoverableError
-from ..formats.safe_path import require_listable, require_unicode
+from ..formats.reading import require_listable, require_unicode
 from ..formats.video import probe_video
 from .config import Config
 from .engine.stages import Stage, TaskWorkers, run_stages

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from ..formats.browser_video import PLAYED, write_browser_video
 from ..formats.errors import InputError
 from ..formats.gaussian_files import read_gaussians
 from ..formats.images import write_rgb
-from ..formats.video_writer import CODECS, write_video
+from ..formats.video_writer import CODECS, PLAYED, write_browser_video, write_video
 from .evaluation.views import (
     Picture,
     SplatScene,

@@ -188,8 +188,8 @@ UNSAFE_BUT_HERE = {
     "pipelines/system/memory.py": {"ctypes"},
     "pipelines/engine/placement.py": {"subprocess"},
     "pipelines/evaluation/html.py": {"subprocess"},
-    "formats/interlaced.py": {"subprocess"},
-    "formats/datasets/calibration_files.py": {"yaml"},
+    "formats/video_streams.py": {"subprocess"},
+    "formats/datasets/calibration.py": {"yaml"},
 }
 """The first calls one function of the C library that runs anyway, with a number; the second starts this program again,
 in the same Python and without a shell; the third prints a report of ours by the browser of this machine, without a

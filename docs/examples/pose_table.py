@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msgs_slam.formats.datasets.camera import Camera
-from msgs_slam.formats.datasets.sequence import Sequence
+from msgs_slam.formats.datasets.sequence import Camera, Sequence
 from msgs_slam.formats.reading import parsing, read_bytes
 from msgs_slam.formats.trajectory import poses_from_quaternions
 

@@ -8,11 +8,10 @@ import numpy as np
 
 from ..colmap import ColmapModel, model_suffix, read_colmap_model
 from ..errors import InputError
-from ..images import natural_key
-from ..safe_path import inside, named_file
-from .camera import Camera
+from ..image_folder import natural_key
+from ..reading import inside, named_file
 from .matching import times_or_frame_numbers
-from .sequence import Sequence
+from .sequence import Camera, Sequence
 
 _MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0")
 _IMAGE_FOLDERS = ("images", "frames", ".", "rgb")

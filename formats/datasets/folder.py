@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..images import count_images, list_images
+from ..image_folder import count_images, list_images
 from ..textfile import read_rows
 from ..trajectory import read_matrices, read_tum
-from .camera import Camera
-from .classes_json import read_classes_json
-from .intrinsics_json import read_intrinsics_json
+from .calibration import read_intrinsics_json
+from .classes import read_classes_json
 from .matching import (
     classes_found,
     files_for_images,
@@ -21,7 +20,7 @@ from .matching import (
     poses_for_images,
     times_or_frame_numbers,
 )
-from .sequence import LabelClass, Sequence
+from .sequence import Camera, LabelClass, Sequence
 
 _IMAGE_FOLDERS = ("rgb", "images", "color", "frames")
 _DEPTH_FOLDERS = ("depth", "depths")

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..image_times import frame_number, read_image_times
-from ..images import IMAGE_SUFFIXES, natural_key
-from ..safe_path import inside
+from ..image_folder import frame_number, natural_key, read_image_times
+from ..images import IMAGE_SUFFIXES
+from ..reading import inside
 from ..textfile import read_rows
 from .sequence import LabelClass, used_label_ids
 

@@ -1,7 +1,8 @@
-"""nerfstudio's transforms.json (also instant-ngp's and Blender's)."""
+"""nerfstudio's transforms.json (also instant-ngp's and Blender's), read as a data set and written for its trainers."""
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -9,14 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..atomic import write_text
 from ..errors import InputError
-from ..images import first_readable, image_size, natural_key
-from ..jsonfile import number, optional_number, read_json_object
-from ..safe_path import named_file
+from ..image_folder import natural_key
+from ..images import first_readable, image_size
+from ..reading import named_file
+from ..textfile import number, optional_number, read_json_object
 from ..trajectory import OPENCV_FROM_OPENGL, clean_poses
-from .camera import Camera, distortion_names
 from .matching import times_or_frame_numbers
-from .sequence import Sequence
+from .sequence import Camera, Sequence, distortion_names
 
 _FILE_NAMES = ("transforms.json", "transforms_train.json")
 _SUFFIXES_TRIED = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -219,3 +221,43 @@ def _shared_intrinsics(
             return refused
         values[key] = mean
     return values, ("the intrinsics of the images differ by less than 1 %: their mean is used",)
+
+
+def write_transforms(
+    path: Path,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    image_paths: tuple[str, ...] | list[str],
+    world_from_cam: NDArray[np.float64],
+    ply_path: str | None = None,
+) -> None:
+    """Write a transforms.json of one pinhole camera.
+
+    image_paths: N, relative to the file; world_from_cam (N, 4, 4), camera axes x right, y down, z forward, which
+    are turned into OpenGL's; the world stays as it is. `ply_path` names a point cloud to start a splat from.
+    Raises ValueError for shapes that do not fit, InputError when the disk refuses.
+    """
+    if world_from_cam.shape != (len(image_paths), 4, 4):
+        raise ValueError(f"write_transforms: got {len(image_paths)} images and poses {world_from_cam.shape}")
+    matrices = world_from_cam @ OPENCV_FROM_OPENGL
+    table: dict[str, object] = {
+        "camera_model": "OPENCV",
+        "w": width,
+        "h": height,
+        "fl_x": float(fx),
+        "fl_y": float(fy),
+        "cx": float(cx),
+        "cy": float(cy),
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+        "frames": [
+            {"file_path": name, "transform_matrix": matrix.tolist()}
+            for name, matrix in zip(image_paths, matrices, strict=True)
+        ],
+    }
+    if ply_path is not None:
+        table["ply_file_path"] = ply_path
+    write_text(path, json.dumps(table, indent=1, allow_nan=False) + "\n")

@@ -10,17 +10,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..images import IMAGE_SUFFIXES, RAW_SUFFIXES
 from ..reading import reaching
-from . import (
-    colmap,
-    euroc,
-    folder,
-    nerfstudio,
-    replica,
-    scannet,
-    scannet_sens,
-    seven_scenes,
-    tum_rgbd,
-)
+from . import benchmarks, colmap, folder, nerfstudio, replica, scannet
 from .sequence import Sequence
 
 
@@ -32,12 +22,12 @@ class _Reader:
 
 # In the order of trying: a plain folder of images comes last, because most data sets are also that.
 _READERS = {
-    "7scenes": _Reader(seven_scenes.recognises, seven_scenes.open_seven_scenes),
+    "7scenes": _Reader(benchmarks.recognises_seven_scenes, benchmarks.open_seven_scenes),
     "replica": _Reader(replica.recognises, replica.open_replica),
-    "tum": _Reader(tum_rgbd.recognises, tum_rgbd.open_tum_rgbd),
-    "euroc": _Reader(euroc.recognises, euroc.open_euroc),
+    "tum": _Reader(benchmarks.recognises_tum, benchmarks.open_tum_rgbd),
+    "euroc": _Reader(benchmarks.recognises_euroc, benchmarks.open_euroc),
     "scannet": _Reader(scannet.recognises, scannet.open_scannet),
-    "sens": _Reader(scannet_sens.recognises, scannet_sens.open_sens),
+    "sens": _Reader(scannet.recognises_sens, scannet.open_sens),
     "nerfstudio": _Reader(nerfstudio.recognises, nerfstudio.open_nerfstudio),
     "colmap": _Reader(colmap.recognises, colmap.open_colmap),
     "folder": _Reader(folder.recognises, folder.open_folder),

@@ -8,18 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..images import first_readable, image_size, list_images
+from ..image_folder import list_images
+from ..images import first_readable, image_size
 from ..trajectory import read_matrices
-from .camera import Camera
-from .classes_json import read_classes_json
-from .intrinsics_json import read_intrinsics_json
+from .calibration import read_intrinsics_json
+from .classes import read_classes_json
 from .matching import (
     classes_found,
     files_for_images,
     poses_for_images,
     times_or_frame_numbers,
 )
-from .sequence import LabelClass, Sequence
+from .sequence import Camera, LabelClass, Sequence
 
 _CLASS_FOLDERS = ("semantic_class", "semantic_classes")
 

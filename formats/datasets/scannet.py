@@ -1,20 +1,32 @@
-"""ScanNet as exported from .sens: color/, depth/, pose/, intrinsic/, label-filt/."""
+"""ScanNet: scenes as color/, depth/, pose/, intrinsic/ and label-filt/, and the .sens files they are exported from."""
 
 from __future__ import annotations
 
+import struct
+import zlib
+from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..images import first_readable, image_size, list_images
+from ..image_folder import list_images
+from ..images import MAX_IMAGE_PIXELS, decode_rgb, first_readable, image_size
+from ..reading import opened, require_file
 from ..textfile import read_table
-from ..trajectory import read_matrices
-from .camera import Camera
-from .matching import classes_found, files_for_images, times_or_frame_numbers
-from .scannet_labels import find_label_table, read_nyu40_classes
-from .sequence import LabelClass, Sequence
+from ..trajectory import clean_poses, read_matrices
+from .classes import find_label_table, read_nyu40_classes
+from .matching import ASSUMED_RATE, classes_found, files_for_images, times_or_frame_numbers
+from .sequence import Camera, LabelClass, Sequence
+
+_VERSION = 4
+_JPEG, _PNG = 2, 1
+_RAW_DEPTH, _ZLIB_DEPTH = 0, 1
+_MAX_NAME_BYTES = 10_000
+_FRAME_HEAD = struct.Struct("<16f4Q")
+_MICROSECONDS = 1e-6
 
 _LABEL_FOLDERS = ("label-filt", "label")
 _COLOR_SIZE, _DEPTH_SIZE = (1296, 968), (640, 480)
@@ -81,3 +93,130 @@ def _classes(path: Path, label_paths: tuple[Path | None, ...]) -> tuple[LabelCla
         return ()
     table = find_label_table(path)
     return classes_found(label_paths) if table is None else read_nyu40_classes(table)
+
+
+def recognises_sens(path: Path) -> bool:
+    """A file named .sens."""
+    return path.is_file() and path.suffix.lower() == ".sens"
+
+
+@dataclass(frozen=True)
+class _Header:
+    color_matrix: NDArray[np.float64]
+    depth_matrix: NDArray[np.float64]
+    depth_kind: int
+    color_size: tuple[int, int]
+    depth_size: tuple[int, int]
+    depth_shift: float
+    frame_count: int
+
+
+@dataclass(frozen=True)
+class SensFrames:
+    """Frames of a .sens file: offsets in the file of each one's colour and depth (N,), and their lengths."""
+
+    path: Path
+    depth_kind: int
+    depth_size: tuple[int, int]
+    starts: NDArray[np.int64]
+    color_bytes: NDArray[np.int64]
+    depth_bytes: NDArray[np.int64]
+
+    def rgb(self, index: int) -> NDArray[np.uint8]:
+        """(H, W, 3) uint8. Raises InputError for a damaged frame."""
+        data = self._read(int(self.starts[index]), int(self.color_bytes[index]))
+        return decode_rgb(data, f"frame {index} of {self.path}")
+
+    def raw_depth(self, index: int) -> NDArray[np.uint16]:
+        """(h, w) uint16. Raises InputError for a damaged frame."""
+        width, height = self.depth_size
+        start = int(self.starts[index] + self.color_bytes[index])
+        data = self._read(start, int(self.depth_bytes[index]))
+        if self.depth_kind == _ZLIB_DEPTH:
+            try:
+                # A limit, because a few bytes of zlib can unpack to gigabytes.
+                data = zlib.decompressobj().decompress(data, width * height * 2)
+            except zlib.error as error:
+                raise InputError(f"{self.path}: depth of frame {index} is damaged ({error}): copy it again") from error
+        if len(data) != width * height * 2:
+            raise InputError(f"{self.path}: depth of frame {index} is damaged: copy the file again")
+        return np.frombuffer(data, dtype="<u2").reshape(height, width).astype(np.uint16)
+
+    def _read(self, start: int, length: int) -> bytes:
+        with opened(self.path) as file:
+            file.seek(start)
+            return file.read(length)
+
+
+def open_sens(path: Path) -> Sequence:
+    """A .sens recording: metric poses, of which lost frames have none, depth of its own camera, no labels.
+
+    Raises InputError for another version or compression, and for a file that ends before its frames do.
+    """
+    size = require_file(path)
+    with opened(path) as file:
+        header = _read_header(file, path)
+        index, poses, times = _read_index(file, path, header.frame_count, size)
+    frames = SensFrames(path, header.depth_kind, header.depth_size, *index)
+    count = header.frame_count
+    increasing = bool((np.diff(times) > 0).all() and times[-1] > times[0])
+    return Sequence(
+        format="sens",
+        root=path,
+        names=tuple(f"{i:06d}.jpg" for i in range(count)),
+        timestamps=(times - times[0]) * _MICROSECONDS if increasing else np.arange(count) / ASSUMED_RATE,
+        timed=increasing,
+        camera=scaled_camera(header.color_matrix, header.color_size, header.color_size),
+        world_from_cam=clean_poses(poses, str(path)),
+        depth_camera=scaled_camera(header.depth_matrix, header.depth_size, header.depth_size),
+        depth_per_metre=header.depth_shift,
+        store=frames,
+    )
+
+
+def _read_header(file: BinaryIO, path: Path) -> _Header:
+    version, name_bytes = _unpack(file, "<IQ", path)
+    if version != _VERSION or name_bytes > _MAX_NAME_BYTES:
+        raise InputError(f"{path} is no .sens file of version {_VERSION}: check that it is the right file")
+    file.seek(name_bytes, 1)
+    matrices = np.array(_unpack(file, "<64f", path), dtype=np.float64).reshape(4, 4, 4)
+    color_kind, depth_kind, *sizes, shift, count = _unpack(file, "<2i4IfQ", path)
+    if color_kind not in (_PNG, _JPEG) or depth_kind not in (_RAW_DEPTH, _ZLIB_DEPTH):
+        raise InputError(
+            f"{path} has colour compression {color_kind} and depth compression {depth_kind}, which cannot be read "
+            "here: export it to a folder with ScanNet's own tool"
+        )
+    if sizes[0] * sizes[1] > MAX_IMAGE_PIXELS or sizes[2] * sizes[3] > MAX_IMAGE_PIXELS or not shift > 0:
+        raise InputError(f"{path} has a damaged header (images of {sizes}): copy it again")
+    return _Header(
+        matrices[0], matrices[2], depth_kind, (sizes[0], sizes[1]), (sizes[2], sizes[3]), float(shift), count
+    )
+
+
+def _read_index(
+    file: BinaryIO, path: Path, count: int, size: int
+) -> tuple[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64], NDArray[np.float64]]:
+    """(starts, colour bytes, depth bytes) of each frame, poses (N, 4, 4) and times (N,) as stored."""
+    if count < 1 or count * _FRAME_HEAD.size > size:
+        raise InputError(f"{path} declares {count} frames in {size / 1e6:.1f} MB: it is damaged, copy it again")
+    rows, poses, times = [], [], []
+    for i in range(count):
+        *matrix, color_time, _, color_bytes, depth_bytes = _unpack(file, _FRAME_HEAD.format, path)
+        start = file.tell()
+        if start + color_bytes + depth_bytes > size:
+            raise InputError(f"{path} ends in frame {i} of {count}: it was not copied completely, copy it again")
+        rows.append((start, color_bytes, depth_bytes))
+        poses.append(matrix)
+        times.append(color_time)
+        file.seek(color_bytes + depth_bytes, 1)
+    columns = np.array(rows, dtype=np.int64).T
+    stored = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
+    return (columns[0], columns[1], columns[2]), stored, np.array(times, dtype=np.float64)
+
+
+def _unpack(file: BinaryIO, layout: str, path: Path) -> tuple:
+    size = struct.calcsize(layout)
+    data = file.read(size)
+    if len(data) != size:
+        raise InputError(f"{path} ends within its headers: it was not copied completely, copy it again")
+    return struct.unpack(layout, data)

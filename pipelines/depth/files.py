@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError
-from ...formats.images import MAX_IMAGE_PIXELS, image_size, natural_key, read_depth_png, read_grey_png
+from ...formats.image_folder import natural_key
+from ...formats.images import MAX_IMAGE_PIXELS, image_size, read_depth_png, read_grey_png
 from ...formats.reading import home_expanded, parsing, reaching, require_file
 from ...formats.tensors import HEADERS
 from ..geometry.camera import resample_nearest, resize_depth

@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 
 from ...formats.atomic import own_temporaries, watched_by
 from ...formats.errors import InputError, RecoverableError
-from ...formats.jsonfile import read_json, write_json
+from ...formats.textfile import read_json, write_json
 from ..config import Config
 from ..run.folder import RunFolder
 from ..run.journal import Journal

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from ...formats.errors import InputError
-from ...formats.jsonfile import read_toml
+from ...formats.textfile import read_toml
 from ..system.progress import log
 from ..types import require_shape
 

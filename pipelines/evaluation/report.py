@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.atomic import write_text
-from ...formats.datasets.camera import distortion_names
-from ...formats.jsonfile import read_json
+from ...formats.datasets.sequence import distortion_names
 from ...formats.reading import read_bytes
+from ...formats.textfile import read_json
 from ..config import Config, config_to_dict
 from ..export.readme import lengths, readme
 from ..export.stage import on_earth

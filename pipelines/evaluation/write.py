@@ -7,7 +7,7 @@ import numpy as np
 from ...formats.atomic import write_text
 from ...formats.datasets import Sequence
 from ...formats.images import write_rgb
-from ...formats.jsonfile import write_json
+from ...formats.textfile import write_json
 from ..geometry.se3 import Similarity, align_points
 from ..outcome import Outcome, evenly, load_outcome
 from ..run.folder import RunFolder

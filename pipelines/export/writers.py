@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 
 from ...formats.atomic import copy_file, write_text
 from ...formats.colmap import ColmapModel, write_colmap_model
+from ...formats.datasets.nerfstudio import write_transforms
 from ...formats.gaussian_glb import write_gaussian_glb
-from ...formats.gaussian_ply import write_gaussian_ply
 from ...formats.gaussians import GaussianCloud
-from ...formats.nerfstudio import write_transforms
-from ...formats.point_ply import write_point_ply
+from ...formats.ply import write_gaussian_ply, write_point_ply
 from ...formats.sog import write_sog
 from ...formats.spz import write_spz
 from ...formats.trajectory import write_tum

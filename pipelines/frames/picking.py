@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from ...formats.atomic import copy_file
 from ...formats.errors import InputError
 from ...formats.images import write_rgb
-from ...formats.jsonfile import read_json, write_json
+from ...formats.textfile import read_json, write_json
 from ...formats.video import VideoFrame
 from ..config import FramesConfig
 from ..engine.stages import StageContext

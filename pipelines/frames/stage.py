@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from ...formats.atomic import copy_file
 from ...formats.errors import InputError, RecoverableError
 from ...formats.gps import photo_places
-from ...formats.images import hint_at_inner_folder, read_rgb, write_rgb
-from ...formats.jsonfile import read_json, write_json
+from ...formats.image_folder import hint_at_inner_folder
+from ...formats.images import read_rgb, write_rgb
+from ...formats.textfile import read_json, write_json
 from ...formats.video import VideoFrame
 from ..config import Config
 from ..engine.stages import Stage, StageContext

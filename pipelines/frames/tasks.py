@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pycolmap
 
-from ...formats.datasets.camera import Camera
+from ...formats.datasets.sequence import Camera
 from ...formats.images import read_rgb
 from ..engine.stages import StageContext
 from ..engine.tasks import Chunk

@@ -40,9 +40,8 @@ from pathlib import Path
 from typing import Any
 
 from ...formats.errors import InputError
-from ...formats.jsonfile import read_json, read_toml
 from ...formats.reading import parsing
-from ...formats.textfile import read_text
+from ...formats.textfile import read_json, read_text, read_toml
 
 VOID_NAMES = frozenset({"void", "none", "unknown", "undefined", "unlabeled", "unlabelled", "ignore"})
 _TABLE_FILES = ("classes.json", "info_semantic.json", "classes.txt", "labels.txt", "classes_used.txt")

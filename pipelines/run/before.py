@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ...formats.atomic import copy_file
 from ...formats.digest import file_sha256
 from ...formats.errors import InputError
-from ...formats.jsonfile import read_json_object, write_json
+from ...formats.textfile import read_json_object, write_json
 from ..types import Calibration, Frame
 from .files import BACKBONE, CALIBRATION, EXPOSURE, FRAMES, MAP, TRAJECTORY
 from .folder import RunFolder

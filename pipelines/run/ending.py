@@ -19,8 +19,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from ...formats.errors import InputError
-from ...formats.jsonfile import read_json_object, write_json
 from ...formats.reading import parsing
+from ...formats.textfile import read_json_object, write_json
 from .finished_files import FinishedFiles
 from .journal import Journal, discard
 from .layouts import dataclass_from_json

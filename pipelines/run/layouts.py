@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ...formats.images import read_grey_png, write_grey_png
-from ...formats.jsonfile import read_json, write_json
 from ...formats.reading import parsing
 from ...formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
+from ...formats.textfile import read_json, write_json
 
 T = TypeVar("T")
 _KINDS = {"f": "f", "i": "iu", "b": "b", "u": "U"}

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from ...formats.digest import file_sha256
 from ...formats.errors import InputError
-from ...formats.jsonfile import read_json_object, write_json
 from ...formats.reading import parsing
+from ...formats.textfile import read_json_object, write_json
 from ..config import Config, config_to_dict
 from ..read_config import merge_known_settings
 from ..system.wording import quoted

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from ...formats.errors import InputError
-from ...formats.jsonfile import read_json
+from ...formats.textfile import read_json
 from ..system.progress import BEGUN, Progress, StageEvent, about
 from .folder import RunFolder
 from .layouts import dataclass_from_json

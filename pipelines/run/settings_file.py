@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from ...formats.atomic import write_text
 from ...formats.errors import InputError
-from ...formats.jsonfile import MAX_TOML_BYTES, read_toml
 from ...formats.reading import opened
+from ...formats.textfile import MAX_TOML_BYTES, read_toml
 from ..config import Config
 from ..read_config import config_to_toml, merge_known_settings
 from ..system.progress import log

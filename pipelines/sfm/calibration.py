@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...formats.datasets.calibration_files import read_calibration_file
-from ...formats.datasets.camera import Camera
+from ...formats.datasets.calibration import read_calibration_file
+from ...formats.datasets.sequence import Camera
 from ...formats.digest import file_sha256
 from ...formats.errors import InputError
 from ...formats.reading import home_expanded, reaching

@@ -14,7 +14,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError
-from ...formats.jsonfile import read_json, write_json
+from ...formats.textfile import read_json, write_json
 from ..system.lru_sequence import LruSequence
 from ..system.memory import release_free_memory
 from ..system.parallel import parallel_map

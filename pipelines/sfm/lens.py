@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from ...formats.datasets.camera import Camera
+from ...formats.datasets.sequence import Camera
 from ..types import Calibration, Intrinsics
 
 _BORDER_POINTS = 65

@@ -14,7 +14,7 @@ import pycolmap
 
 from ...formats.atomic import free_bytes, write_bytes
 from ...formats.errors import DiskFullError
-from ...formats.jsonfile import read_json, write_json
+from ...formats.textfile import read_json, write_json
 from ..system.values import load_value, save_value
 
 T = TypeVar("T")

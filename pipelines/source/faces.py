@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.datasets.camera import Camera
+from ...formats.datasets.sequence import Camera
 from ...formats.errors import InputError
-from ...formats.spherical import PART, WHOLE, image_sphere, video_sphere
+from ...formats.video_streams import PART, WHOLE, image_sphere, video_sphere
 from ..config import FramesConfig
 from ..geometry.rig import CUBE, LEVEL
 from ..sfm.calibration import read_intrinsics

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.datasets.camera import Camera
+from ...formats.datasets.sequence import Camera
 from ..sfm.lens import make_lens, to_pycolmap
 from ..types import Calibration
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...formats.atomic import write_text
 from ...formats.errors import InputError
-from ...formats.safe_path import require_listable
+from ...formats.reading import require_listable
 from ...formats.video import VideoFrame, probe_video
 from ..config import Config, FramesConfig
 from ..frames.learned import open_learned, picture_features

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from ...formats.errors import InputError
-from ...formats.jsonfile import number, read_json_object
+from ...formats.textfile import number, read_json_object
 
 Array = NDArray[np.float64]
 

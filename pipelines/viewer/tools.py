@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.gaussian_ply import write_gaussian_ply
+from ...formats.ply import write_gaussian_ply
 from ..geometry.tape import Touch, area, area_text, tape, tape_text, touch
 from ..types import VOID
 from .scene import ViewerScene, client_view

@@ -24,7 +24,7 @@ import numpy as np
 from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import read_json_object, write_json
+from msgs_slam.formats.textfile import read_json_object, write_json
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import Stage
 from msgs_slam.pipelines.engine.standing import next_upstream, stage_fingerprint

@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 from msgs_slam.formats.digest import file_sha256
-from msgs_slam.formats.jsonfile import read_json_object, write_json
+from msgs_slam.formats.textfile import read_json_object, write_json
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.read_config import load_config

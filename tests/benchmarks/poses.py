@@ -103,8 +103,8 @@ def disturbed(world_from_cam: Array) -> Array:
 
 def write_given(source: Path, case: Case, path: Path) -> Path:
     """The disturbed truth of a folder's pictures as a JSON list."""
-    from msgs_slam.formats.images import list_images
-    from msgs_slam.formats.jsonfile import write_json
+    from msgs_slam.formats.image_folder import list_images
+    from msgs_slam.formats.textfile import write_json
 
     names = [p.name for p in list_images(source)]
     truth = [case.truth(n, i) for i, n in enumerate(names)]

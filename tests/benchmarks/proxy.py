@@ -35,7 +35,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tracking import write_noisy_depth
 
-from msgs_slam.formats.images import natural_key, read_depth_png
+from msgs_slam.formats.image_folder import natural_key
+from msgs_slam.formats.images import read_depth_png
 from msgs_slam.pipelines.geometry.camera import project, resample_nearest, unproject_depth
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct

@@ -285,7 +285,7 @@ def original_names(source: Path, frames: Sequence[Any]) -> list[str]:
     """Names of the frames' pictures in a folder; nothing for a video."""
     if source.is_file():
         return [""] * len(frames)
-    from msgs_slam.formats.images import list_images
+    from msgs_slam.formats.image_folder import list_images
 
     names = [p.name for p in list_images(source)]
     return [names[f.source_index] for f in frames]

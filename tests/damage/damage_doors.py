@@ -31,31 +31,32 @@ from tokenizers import models as tokenizer_models
 
 from msgs_slam.formats.colmap import read_colmap_model, write_colmap_model
 from msgs_slam.formats.datasets import Camera, Sequence, open_sequence, recognise_source
-from msgs_slam.formats.datasets.classes_json import read_classes_json
-from msgs_slam.formats.datasets.intrinsics_json import read_intrinsics_json
-from msgs_slam.formats.datasets.scannet_labels import read_nyu40_classes
+from msgs_slam.formats.datasets.calibration import read_intrinsics_json
+from msgs_slam.formats.datasets.classes import read_classes_json, read_nyu40_classes
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gaussian_files import read_gaussians
 from msgs_slam.formats.gaussian_glb import write_gaussian_glb
-from msgs_slam.formats.gaussian_ply import write_gaussian_ply
 from msgs_slam.formats.gaussians import GaussianCloud
-from msgs_slam.formats.image_times import read_image_times
+from msgs_slam.formats.image_folder import (
+    list_images,  # fmt: skip
+    read_image_times,
+)
 from msgs_slam.formats.images import (
     exif_focal_px,
     exif_time,
     image_size,
-    list_images,
     read_depth_png,
     read_grey_png,
     read_label_png,
     read_rgb,
     write_grey_png,
     write_rgb,
-)  # fmt: skip
-from msgs_slam.formats.jsonfile import read_toml, write_json
+)
 from msgs_slam.formats.mesh import MeshArrays, MeshBlocks, read_mesh_ply, write_mesh_ply
+from msgs_slam.formats.ply import write_gaussian_ply
 from msgs_slam.formats.spz import write_spz
 from msgs_slam.formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
+from msgs_slam.formats.textfile import read_toml, write_json
 from msgs_slam.formats.trajectory import read_matrices, read_tum, write_tum
 from msgs_slam.formats.video import VideoReader, probe_video
 from msgs_slam.formats.video_writer import write_video

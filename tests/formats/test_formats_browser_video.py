@@ -7,8 +7,8 @@ import av
 import numpy as np
 import pytest
 
-from msgs_slam.formats.browser_video import H264, MPEG4, VP9, best_codec, write_browser_video
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.video_writer import H264, MPEG4, VP9, best_codec, write_browser_video
 
 
 def pictures() -> list[np.ndarray]:
@@ -35,7 +35,7 @@ def test_each_codec_shows_the_pictures(codec: str, name: str, tmp_path: Path) ->
 
 def test_the_best_codec_is_one_that_browsers_play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert best_codec(tmp_path) == H264, "PyAV is there"
-    monkeypatch.setattr("msgs_slam.formats.browser_video._has_x264", lambda: False)
+    monkeypatch.setattr("msgs_slam.formats.video_writer._has_x264", lambda: False)
     assert best_codec(tmp_path) in (VP9, MPEG4)
     assert list(tmp_path.iterdir()) == []
 

@@ -12,8 +12,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.datasets import VOID_LABEL, Camera, Sequence, open_sequence, recognise
-from msgs_slam.formats.datasets.camera import warp_nearest
 from msgs_slam.formats.datasets.matching import poses_at
+from msgs_slam.formats.datasets.sequence import warp_nearest
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
 from msgs_slam.formats.trajectory import write_tum

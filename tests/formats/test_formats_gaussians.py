@@ -10,8 +10,8 @@ import plyfile
 import pytest
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussian_ply import SH_C0, read_gaussian_ply, write_gaussian_ply
 from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
+from msgs_slam.formats.ply import SH_C0, read_gaussian_ply, write_gaussian_ply
 
 
 def _cloud(m: int = 300, classes: int = 7) -> GaussianCloud:

@@ -17,7 +17,7 @@ from pillow_heif import from_bytes
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.exif import ExifLens, lens_of, place_of
-from msgs_slam.formats.image_times import frame_number, read_image_times
+from msgs_slam.formats.image_folder import frame_number, list_images, natural_key, read_image_times
 from msgs_slam.formats.images import (
     decode_rgb,
     exif_focal_px,
@@ -25,8 +25,6 @@ from msgs_slam.formats.images import (
     exif_time,
     image_size,
     is_plain,
-    list_images,
-    natural_key,
     read_depth_png,
     read_grey_png,
     read_label_png,

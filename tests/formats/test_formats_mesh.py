@@ -10,7 +10,7 @@ import plyfile
 import pytest
 import trimesh
 
-from msgs_slam.formats import ply_table
+from msgs_slam.formats import ply as ply_table
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.mesh import MeshBlocks, mesh_blocks, read_mesh_ply, write_mesh_glb, write_mesh_ply
 

@@ -9,11 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from msgs_slam.formats.display import pixel_aspect
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.hdr_video import AvCapture
-from msgs_slam.formats.spherical import read_moov, video_sphere
-from msgs_slam.formats.video import VideoReader, probe_video
+from msgs_slam.formats.video import VideoReader, pixel_aspect, probe_video
+from msgs_slam.formats.video_streams import AvCapture, read_moov, video_sphere
 from msgs_slam.pipelines.source.opening import VideoSource
 from tests.formats.test_formats_video import encode, hdr_signal, textured, with_matrix, woven, write_hdr
 

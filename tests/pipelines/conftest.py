@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.jsonfile import write_json
+from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.config import Config, MappingConfig
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap

@@ -15,7 +15,7 @@ from ....formats.atomic import require_room
 from ....formats.gaussian_glb import COMPRESSION, EXTENSION, write_compressed_glb
 from ....formats.gaussians import GaussianCloud, isotropic_cloud
 from ....formats.gps import ecef_from_enu
-from ....formats.jsonfile import write_json
+from ....formats.textfile import write_json
 from ...outcome import Outcome
 from ...run.journal import empty
 from ...scene.world import Z_UP_FROM_Y_DOWN, World

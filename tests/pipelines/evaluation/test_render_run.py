@@ -11,7 +11,8 @@ from finished import note_finished
 
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.images import list_images, read_rgb
+from msgs_slam.formats.image_folder import list_images
+from msgs_slam.formats.images import read_rgb
 from msgs_slam.formats.video import VideoReader
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.demo import TRUTH, VIDEO, demo_summary, run_demo, unpack_demo_clip

@@ -9,9 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussian_ply import write_gaussian_ply
 from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
-from msgs_slam.formats.images import list_images, read_rgb
+from msgs_slam.formats.image_folder import list_images
+from msgs_slam.formats.images import read_rgb
+from msgs_slam.formats.ply import write_gaussian_ply
 from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.evaluation.views import SplatScene, draw_splats, render_outcome
 from msgs_slam.pipelines.outcome import load_outcome, map_cloud

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussian_ply import read_gaussian_ply
+from msgs_slam.formats.ply import read_gaussian_ply
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.viewer.scene import load_scenes
 from msgs_slam.pipelines.viewer.tools import round_range

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msgs_slam.formats.gaussian_ply import write_gaussian_ply
 from msgs_slam.formats.gaussians import isotropic_cloud
+from msgs_slam.formats.ply import write_gaussian_ply
 from msgs_slam.pipelines.viewer.door import is_welcome
 
 pytest.importorskip("viser")

@@ -11,8 +11,8 @@ import pytest
 from finished import note_finished
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussian_ply import write_gaussian_ply
 from msgs_slam.formats.gaussians import isotropic_cloud
+from msgs_slam.formats.ply import write_gaussian_ply
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.files import BACKBONE, FRAMES, MAP, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder

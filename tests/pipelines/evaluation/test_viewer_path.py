@@ -13,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussian_ply import write_gaussian_ply
 from msgs_slam.formats.gaussians import isotropic_cloud
-from msgs_slam.formats.images import list_images, read_rgb
+from msgs_slam.formats.image_folder import list_images
+from msgs_slam.formats.images import read_rgb
+from msgs_slam.formats.ply import write_gaussian_ply
 from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.render_run import render_file, render_run

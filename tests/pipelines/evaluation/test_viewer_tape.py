@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import Sequence
-from msgs_slam.formats.gaussian_ply import read_gaussian_ply
 from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
+from msgs_slam.formats.ply import read_gaussian_ply
 from msgs_slam.pipelines.geometry.tape import Touch, area, area_text, tape, tape_text, touch
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Metres

@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.sequence import Camera
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config, FramesConfig
 from msgs_slam.pipelines.engine.stages import StageContext

@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.sequence import Camera
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.spherical import PART, WHOLE, image_sphere, video_sphere
+from msgs_slam.formats.video_streams import PART, WHOLE, image_sphere, video_sphere
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.frames.stage import check
 from msgs_slam.pipelines.geometry.rig import CUBE, ONE_CAMERA, Rig, rig_of

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.sequence import Camera
 from msgs_slam.pipelines.sfm import focal as focal_module
 from msgs_slam.pipelines.sfm.focal import _errors, _rotation, calibrated, two_view_lens
 from msgs_slam.pipelines.sfm.lens import to_pycolmap, unknown_camera

@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.sequence import Camera
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry import se3

@@ -15,7 +15,7 @@ import pytest
 
 from msgs_slam.formats.errors import DiskFullError, InputError
 from msgs_slam.formats.images import read_rgb, write_rgb
-from msgs_slam.formats.jsonfile import read_json
+from msgs_slam.formats.textfile import read_json
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.geometry.se3 import align_points

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from msgs_slam.formats.datasets.camera import Camera
+from msgs_slam.formats.datasets.sequence import Camera
 from msgs_slam.pipelines.sfm.lens import to_pycolmap
 from tests.pipelines.frames.made_views import structure_of, walk_round
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.formats.jsonfile import write_json
+from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.depth.fields import FINE, DepthFields
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.image_quality import DepthErrorSum

@@ -12,7 +12,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from msgs_slam.formats.jsonfile import write_json
+from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.engine.stages import StageContext

@@ -9,7 +9,7 @@ from finished import note_finished
 from numpy.typing import NDArray
 
 from msgs_slam.formats.images import read_rgb
-from msgs_slam.formats.jsonfile import write_json
+from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.files import (

@@ -10,7 +10,7 @@ import pytest
 from proxy_room import UNIT, Room
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import read_json
+from msgs_slam.formats.textfile import read_json
 from msgs_slam.pipelines.depth.files import FilesDepth
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.labels.files import FilesLabels

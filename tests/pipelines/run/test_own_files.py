@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.jsonfile import MAX_JSON_BYTES, read_json
 from msgs_slam.formats.tensors import load_arrays
+from msgs_slam.formats.textfile import MAX_JSON_BYTES, read_json
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.records import Manifest, Source, StageRecord, load_records, write_manifest
 from msgs_slam.pipelines.system.values import load_value, save_value

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gps import enu_from_geodetic, photo_places, read_track
-from msgs_slam.formats.images import list_images
+from msgs_slam.formats.image_folder import list_images
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.geometry.se3 import Similarity

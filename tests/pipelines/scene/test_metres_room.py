@@ -9,7 +9,7 @@ import pytest
 from finished import note_finished
 from numpy.typing import NDArray
 
-from msgs_slam.formats.jsonfile import read_json, write_json
+from msgs_slam.formats.textfile import read_json, write_json
 from msgs_slam.pipelines.config import Config, ExportConfig
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.engine.stages import StageContext

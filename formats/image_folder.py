@@ -1,4 +1,4 @@
-"""When the images of a folder were taken: from a list beside them, else from EXIF."""
+"""The images of a folder: which they are, their order, and when they were taken."""
 
 from __future__ import annotations
 
@@ -9,11 +9,62 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
-from .images import exif_time, read_rgb
+from .images import IMAGE_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES, exif_time, read_rgb
 from .reading import reaching
 from .textfile import read_rows
 
 _LIST_NAMES = ("timestamps.txt", "times.txt", "rgb.txt")
+
+
+def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Sort key under which img2 comes before img10. Raises nothing; equal names have equal keys."""
+    parts = re.split(r"([0-9]+)", name)
+    return tuple((0, int(p), p) if p.isdecimal() and p.isascii() else (1, 0, p) for p in parts)
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The image files directly in `folder`, in natural order; hidden files are left out.
+
+    Raises InputError when there is no such folder or no image in it.
+    """
+    folder = Path(folder)
+    with reaching(folder):
+        if not folder.is_dir():
+            raise InputError(f"no such folder: {folder}: check the spelling, and that the disk is mounted")
+        files = [p for p in folder.iterdir() if not p.name.startswith(".") and p.is_file()]
+    images = [p for p in files if p.suffix.lower() in IMAGE_SUFFIXES]
+    if not images:
+        raise InputError(_why_no_images(folder, files))
+    return sorted(images, key=lambda p: natural_key(p.name))
+
+
+def count_images(folder: Path) -> int:
+    """Count the image files directly in a folder, hidden ones left out; 0 where there is no such folder."""
+    try:
+        names = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
+        return sum(p.is_file() for p in names)
+    except OSError:  # none, no folder, or none that may be read
+        return 0
+
+
+def hint_at_inner_folder(folder: Path, least: int = 2) -> str:
+    """Name the folder directly in `folder` with the most images; "" where none has `least`."""
+    counts = {p.name: count_images(p) for p in sorted(folder.iterdir()) if not p.name.startswith(".")}
+    name = max(counts, key=counts.__getitem__, default="")
+    return f"the folder {name}/ in it holds {counts[name]} images: give that" if counts.get(name, 0) >= least else ""
+
+
+def _why_no_images(folder: Path, files: list[Path]) -> str:
+    raw = sorted({p.suffix.lower() for p in files} & RAW_SUFFIXES)
+    if raw:
+        return f"no readable image in {folder}: {', '.join(raw)} files are not supported, export them as JPEG first"
+    videos = sorted(p.name for p in files if p.suffix.lower() in VIDEO_SUFFIXES)
+    if videos:
+        more = f"{len(videos)} videos, such as {videos[0]}" if videos[1:] else f"the video {videos[0]}"
+        return f"no images in {folder}, but {more}: give one of them, or the folder to `msgs-slam batch`"
+    hint = hint_at_inner_folder(folder)
+    kinds = f"give the folder that directly holds the {', '.join(sorted(IMAGE_SUFFIXES))} files"
+    return f"no images in {folder} ({len(files)} other files): {hint or kinds}"
 
 
 def read_image_times(images: list[Path]) -> NDArray[np.float64] | None:

@@ -1,10 +1,21 @@
-"""Video by PyAV: HDR (HLG, PQ) in the colours of ordinary images, where OpenCV's decoder cuts it to 8 flat bits, and
-other video that OpenCV cannot decode."""
+"""What OpenCV does not do for a video: read its boxes (panorama, HDR), find interlaced streams, and decode by PyAV.
+
+PyAV reads HDR (HLG, PQ), which OpenCV's decoder cuts to 8 flat bits, codecs that OpenCV does not have, and interlaced
+video: each frame holds two fields (half pictures) of different times, or is one. OpenCV's FFmpeg (from OpenCV 4.13 on)
+cannot convert such frames, and does not say so: it hands out whatever its buffer held before, black, the last frame, or
+a picture of another video."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
+import os
+import re
+import shlex
+import struct
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,9 +23,36 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from .containers import OPEN_OPTIONS
-from .spherical import read_moov
+from .errors import InputError
+from .reading import parsing
+
+# The containers of one video each. Left out is what names other files (playlists, scripts, numbered images) or is made
+# into images by FFmpeg (text): such a file would show files from elsewhere on this disk, whatever it is called.
+_CONTAINERS = (
+    "mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "mpegts", "mpeg", "mpegvideo", "m4v", "flv", "live_flv", "asf",
+    "asf_o", "ogg", "gif", "apng", "h264", "hevc", "av1", "obu", "ivf", "vvc", "vc1", "dv", "mxf", "nut", "wtv", "rm",
+    "h263", "mjpeg", "mjpeg_2000", "yuv4mpegpipe", "gxf", "swf", "nsv", "dirac", "cavsvideo", "avs2", "avs3", "r3d",
+)  # fmt: skip
+OPEN_OPTIONS = {"format_whitelist": ",".join(_CONTAINERS), "protocol_whitelist": "file"}
+
+_PROGRESSIVE = 1
+"""AV_FIELD_PROGRESSIVE; 0 is unknown, all above are interlaced."""
+_TIMEOUT = 120.0
+_LISTEN = (
+    "import sys, cv2\n"
+    "capture = cv2.VideoCapture(sys.argv[1], cv2.CAP_FFMPEG)\n"
+    "for _ in range(int(sys.argv[2])): capture.read()"
+)
+
+WHOLE, PART = "equirectangular", "part of a sphere"
+_MOST_OF_MOOV = 64 << 20
+_MOST_BOXES = 10_000
+_FIRST_BOXES = (b"ftyp", b"styp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot", b"uuid")
+"""One of these is at the start of an MP4 or MOV; a raw stream of H.264 or HEVC looks like a box of another kind."""
+_PROJECTION = re.compile(rb"ProjectionType\W{1,4}([a-z]+)")
+_SECOND_EYE = re.compile(rb"GSpherical:StereoMode>\s*(?!mono)\w")
 
 _TRANSFERS = {16: "PQ", 18: "HLG"}  # ITU-T H.273, table 3
 _KNEE = 0.75
@@ -185,3 +223,119 @@ def _srgb() -> NDArray[np.uint8]:
     light = np.arange(_FINE) / (_FINE - 1)
     curved = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     return np.round(curved * 255).astype(np.uint8)
+
+
+def read_moov(path: Path) -> bytes:
+    """The head of an MP4 or MOV, at most 64 MB of it; nothing for any other file, or where a length is damaged."""
+    end = path.stat().st_size
+    with open(path, "rb") as file:
+        for _ in range(_MOST_BOXES):
+            start = file.tell()
+            head = file.read(8)
+            size, kind = struct.unpack(">I4s", head) if len(head) == 8 else (0, b"")
+            if start == 0 and kind not in _FIRST_BOXES:
+                break
+            if size == 1:
+                size = int.from_bytes(file.read(8), "big")
+            if kind == b"moov":
+                return file.read(min(max(0, start + size - file.tell()), _MOST_OF_MOOV))
+            if size < file.tell() - start or start + size >= end:
+                break
+            file.seek(start + size)
+    return b""
+
+
+def video_sphere(path: Path) -> str:
+    """WHOLE, PART (one eye of two, half a sphere, a cube map) or "" for what says nothing of the kind.
+
+    By the boxes of the Spherical Video RFC (github.com/google/spatial-media): its second version's `st3d` and `sv3d`,
+    or the XML of its first.
+    """
+    moov = read_moov(path)
+    if (place := moov.find(b"sv3d")) >= 0:
+        whole = moov.find(b"equi", place)
+        # equi: version and flags, then how much is cut off at the top, bottom, left and right
+        is_whole = whole >= 0 and not any(moov[whole + 8 : whole + 24])
+        eyes = moov.find(b"st3d")
+        return WHOLE if is_whole and (eyes < 0 or moov[eyes + 8 : eyes + 9] in (b"", b"\0")) else PART
+    found = _PROJECTION.search(moov) if b"GSpherical" in moov else None
+    if found is None:
+        return ""
+    return WHOLE if found[1] == WHOLE.encode() and not _SECOND_EYE.search(moov) else PART
+
+
+def image_sphere(path: Path) -> str:
+    """Return WHOLE, PART or "" for an image, by its Photo Sphere XMP (Google), which a crop may have kept unchanged."""
+    try:
+        with parsing(path, "image"), Image.open(path) as image:
+            xmp = image.info.get("xmp", b"")
+    except InputError:
+        return ""
+    found = _PROJECTION.search(xmp if isinstance(xmp, bytes) else str(xmp).encode())
+    return "" if found is None else WHOLE if found[1] == WHOLE.encode() else PART
+
+
+def has_pyav() -> bool:
+    """Whether PyAV is there (the extra "hdr")."""
+    try:
+        import av  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def is_interlaced(path: Path, frames: int) -> bool:
+    """Whether FFmpeg takes the stream, or one of its first `frames`, for interlaced; False for what it cannot read."""
+    return _by_pyav(path, frames) if has_pyav() else _by_listening(path, frames)
+
+
+def _by_pyav(path: Path, frames: int) -> bool:
+    import av
+
+    try:
+        with av.open(str(path), options=OPEN_OPTIONS) as container:
+            if not container.streams.video:
+                return False
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            if stream.codec_context.field_order > _PROGRESSIVE:
+                return True
+            return any(frame.interlaced_frame for frame in itertools.islice(container.decode(stream), frames))
+    except (av.FFmpegError, OSError, ValueError):
+        return False
+
+
+def _by_listening(path: Path, frames: int) -> bool:
+    """OpenCV asks FFmpeg for its errors once, when it is first used: only another process can hear them."""
+    said = {"OPENCV_FFMPEG_LOGLEVEL": "16", "OPENCV_FFMPEG_CAPTURE_OPTIONS": as_opencv_writes_them()}
+    command = [sys.executable, "-c", _LISTEN, str(path.resolve()), str(frames)]
+    try:
+        done = subprocess.run(command, env=os.environ | said, capture_output=True, timeout=_TIMEOUT, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return b"interlaced" in done.stdout + done.stderr
+
+
+def unreadable(path: Path, codec: str, first: int = 0) -> InputError:
+    """Say that a video is interlaced from frame `first` on and how to convert it; `codec` by its four letters or
+    FFmpeg's name. HEVC stores each field as a picture of its own, which have to be joined first."""
+    file = shlex.quote(str(path))
+    if codec.lower() in ("hevc", "hev1", "hvc1"):
+        return InputError(
+            f"{path} is interlaced video whose fields are stored as separate images: convert it with "
+            f"`ffmpeg -i {file} -vf weave,bwdif OUT.mp4`"
+        )
+    if has_pyav():
+        return InputError(
+            f"{path} is interlaced from about frame {first} on, and progressive before: convert it with "
+            f"`ffmpeg -i {file} -vf yadif OUT.mp4`"
+        )
+    return InputError(
+        f"{path} is interlaced video (as from camcorders and television), which OpenCV does not decode: install PyAV "
+        f"with `pip install 'msgs-slam[hdr]'`, or convert it with `ffmpeg -i {file} -vf yadif OUT.mp4`"
+    )
+
+
+def as_opencv_writes_them() -> str:
+    """OPEN_OPTIONS as the variable OPENCV_FFMPEG_CAPTURE_OPTIONS has them."""
+    return "|".join(f"{name};{value}" for name, value in OPEN_OPTIONS.items())

@@ -1,0 +1,205 @@
+"""Benchmarks of one layout each:
+
+- Microsoft 7-Scenes: frame-XXXXXX.color, .depth.png, .pose.txt in one folder.
+- TUM RGB-D: rgb.txt, depth.txt and groundtruth.txt, each with its own clock times.
+- EuRoC MAV, left camera: mav0/cam0 with data.csv and sensor.yaml."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..image_folder import frame_number, list_images
+from ..images import first_readable, image_size
+from ..textfile import read_table, read_text
+from ..trajectory import clean_poses, poses_from_quaternions, read_matrices, read_tum
+from .calibration import read_intrinsics_json
+from .matching import ASSUMED_RATE, SAME_INSTANT_SECONDS, files_for_images, nearest_index, poses_at, read_timed_files
+from .sequence import Camera, Sequence
+
+_NANOSECONDS = 1e-9
+
+_DEPTH_PER_METRE = 5000.0
+_TUM_LINE = "`seconds file`"
+
+# The calibration of the three cameras that the benchmark's page publishes; its archives hold none.
+_FREIBURG = {
+    "1": (517.306408, 516.469215, 318.643040, 255.313989, (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)),
+    "2": (520.908620, 521.007327, 325.141442, 249.701764, (0.231222, -0.784899, -0.003257, -0.000105, 0.917205)),
+    "3": (535.4, 539.2, 320.1, 247.6, (0.0, 0.0, 0.0, 0.0)),
+}
+_FREIBURG_DEFAULT = (525.0, 525.0, 319.5, 239.5, (0.0, 0.0, 0.0, 0.0))
+
+_COLOR_FOCAL, _DEPTH_FOCAL = 525.0, 585.0
+_SEVEN_SCENES_NOTES = (
+    "poses are KinectFusion's, good to about 1 cm",
+    "depth comes from a second camera beside the colour camera; the 2.5 cm between them are not corrected",
+)
+
+
+def recognises_seven_scenes(path: Path) -> bool:
+    """frame-000000.color.png and the like."""
+    return any(path.glob("frame-*.color.*"))
+
+
+def open_seven_scenes(path: Path) -> Sequence:
+    """One seq-XX folder of 7-Scenes. Metric poses; frames whose pose file is missing or not finite have none.
+
+    The set names no calibration of the colour camera: camera-intrinsics-color.txt (3x3) is used where somebody made
+    one, else the focal length of 525 that relocalisation papers use; the depth camera has camera-intrinsics.txt or
+    585. Both give the principal point as the middle of the image.
+    """
+    images = [p for p in list_images(path) if ".color." in p.name]
+    numbers = [frame_number(p) for p in images]
+    if not images or None in numbers:
+        raise InputError(f"{path} has no frame-XXXXXX.color images: give one of the scene's seq-XX folders")
+    size = image_size(first_readable(images))
+    return Sequence(
+        format="7scenes",
+        root=path,
+        names=tuple(p.name for p in images),
+        timestamps=np.array(numbers, dtype=np.float64) / ASSUMED_RATE,
+        image_paths=tuple(images),
+        camera=_seven_scenes_camera(path / "camera-intrinsics-color.txt", size, _COLOR_FOCAL),
+        world_from_cam=np.stack([_seven_scenes_pose(p) for p in images]),
+        depth_paths=files_for_images(images, path, "*.depth.png"),
+        depth_camera=_seven_scenes_camera(path / "camera-intrinsics.txt", (640, 480), _DEPTH_FOCAL),
+        notes=_SEVEN_SCENES_NOTES,
+    )
+
+
+def _seven_scenes_pose(image: Path) -> NDArray[np.float64]:
+    path = image.with_name(image.name.split(".")[0] + ".pose.txt")
+    return read_matrices(path)[0] if path.is_file() else np.full((4, 4), np.nan)
+
+
+def _seven_scenes_camera(path: Path, size: tuple[int, int], focal: float) -> Camera:
+    width, height = size
+    if not path.is_file():
+        scale = width / 640
+        return Camera(width, height, focal * scale, focal * scale, width / 2, height / 2, is_nominal=True)
+    k = read_table(path, 3)
+    if k.shape != (3, 3):
+        raise InputError(f"{path} has {len(k)} rows of 3 numbers, expected a 3x3 calibration matrix")
+    return Camera(width, height, float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
+
+
+def recognises_tum(path: Path) -> bool:
+    """A folder with rgb.txt and the images it lists."""
+    return (path / "rgb.txt").is_file() and (path / "rgb").is_dir()
+
+
+def open_tum_rgbd(path: Path) -> Sequence:
+    """A TUM RGB-D sequence: metric poses of the colour camera, depth registered to colour.
+
+    Images, depth and poses are joined by the nearest time within 20 ms. The calibration is intrinsics.json where
+    there is one, else that of the freiburg camera in the folder's name, else 525. Raises InputError for lists that
+    cannot be read or name files outside the folder.
+    """
+    times, images = read_timed_files(path / "rgb.txt", path, float, _TUM_LINE)
+    camera, notes = _tum_camera(path, first_readable(images))
+    truth = path / "groundtruth.txt"
+    return Sequence(
+        format="tum",
+        root=path,
+        names=tuple(p.name for p in images),
+        timestamps=times,
+        image_paths=tuple(images),
+        camera=camera,
+        world_from_cam=poses_at(times, *read_tum(truth)) if truth.is_file() else None,
+        depth_paths=_tum_depth(path, times),
+        depth_per_metre=_DEPTH_PER_METRE,
+        notes=notes,
+    )
+
+
+def _tum_depth(path: Path, times: NDArray[np.float64]) -> tuple[Path | None, ...]:
+    if not (path / "depth.txt").is_file():
+        return ()
+    depth_times, files = read_timed_files(path / "depth.txt", path, float, _TUM_LINE)
+    index = nearest_index(depth_times, times)
+    near = np.abs(depth_times[index] - times) <= SAME_INSTANT_SECONDS
+    return tuple(files[i] if ok else None for i, ok in zip(index, near, strict=True))
+
+
+def _tum_camera(path: Path, image: Path) -> tuple[Camera | None, tuple[str, ...]]:
+    if (path / "intrinsics.json").is_file():
+        return read_intrinsics_json(path / "intrinsics.json", integer_centres=True)[0], ()
+    width, height = image_size(image)
+    found = re.search(r"(?:freiburg|fr)([123])(?![0-9])", path.resolve().name)
+    fx, fy, cx, cy, distortion = _FREIBURG[found[1]] if found else _FREIBURG_DEFAULT
+    if abs(width / height - 640 / 480) > 0.02:
+        return None, ("the images have not the shape of a Kinect's: the camera is taken to be unknown",)
+    notes = () if found else ("the folder's name states no freiburg camera: a focal length near 525 is expected",)
+    camera = Camera.from_integer_centres(640, 480, fx, fy, cx, cy, distortion).resized(width, height)
+    return replace(camera, is_nominal=not found), notes
+
+
+def recognises_euroc(path: Path) -> bool:
+    """A folder with mav0/cam0/data.csv, or mav0 itself."""
+    return any((root / "cam0" / "data.csv").is_file() for root in (path / "mav0", path))
+
+
+def open_euroc(path: Path) -> Sequence:
+    """The left camera of a EuRoC sequence: metric poses, grey images with lens distortion, no depth.
+
+    Poses are those of the body, moved to the camera by the extrinsics in sensor.yaml. Raises InputError where a table
+    or the calibration cannot be read.
+    """
+    root = path / "mav0" if (path / "mav0" / "cam0").is_dir() else path
+    times, images = _euroc_images(root / "cam0")
+    camera, body_from_cam = _euroc_calibration(root / "cam0" / "sensor.yaml")
+    return Sequence(
+        format="euroc",
+        root=path,
+        names=tuple(p.name for p in images),
+        timestamps=times,
+        image_paths=tuple(images),
+        camera=camera,
+        world_from_cam=_euroc_poses(root / "state_groundtruth_estimate0" / "data.csv", times, body_from_cam),
+    )
+
+
+def _euroc_images(cam: Path) -> tuple[NDArray[np.float64], list[Path]]:
+    times, files = read_timed_files(cam / "data.csv", cam / "data", int, "`nanoseconds,file`")
+    return times * _NANOSECONDS, files
+
+
+def _euroc_poses(
+    path: Path, times: NDArray[np.float64], body_from_cam: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """Rows of time, position, quaternion w x y z of the body in the world."""
+    if not path.is_file():
+        return None
+    table = read_table(path, 8)
+    world_from_body = poses_from_quaternions(table[:, [5, 6, 7, 4]], table[:, 1:4], str(path))
+    return poses_at(times, table[:, 0] * _NANOSECONDS, world_from_body @ body_from_cam)
+
+
+def _euroc_calibration(path: Path) -> tuple[Camera, NDArray[np.float64]]:
+    text = read_text(path)
+    fx, fy, cx, cy = _yaml_numbers(text, path, "intrinsics", 4)
+    width, height = _yaml_numbers(text, path, "resolution", 2)
+    distortion = _yaml_numbers(text, path, "distortion_coefficients", 4)
+    transform = np.array(_yaml_numbers(text, path, "data", 16)).reshape(1, 4, 4)
+    if not np.isfinite([width, height, *transform.ravel()]).all():
+        raise InputError(f"{path}: a number is not finite: unpack the data set again")
+    camera = Camera.from_integer_centres(int(width), int(height), fx, fy, cx, cy, tuple(distortion))
+    return camera, clean_poses(transform, str(path))[0]
+
+
+def _yaml_numbers(text: str, path: Path, key: str, count: int) -> list[float]:
+    """The list under a key of the YAML file, which may go over several lines."""
+    found = re.search(rf"^\s*{key}\s*:\s*\[([^\]]*)\]", text, flags=re.MULTILINE)
+    try:
+        values = [float(part) for part in found[1].split(",")] if found else []
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise InputError(f"{path}: {key!r} is missing or not a list of {count} numbers: unpack the data set again")
+    return values
