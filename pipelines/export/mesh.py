@@ -3,29 +3,31 @@
 Each step is a task over chunks of keyframes or of regions, and leaves files in the stage's snapshot.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.mesh import MeshBlocks
+from ...formats.mesh import MeshBlocks, mesh_blocks, read_mesh_ply, write_mesh_glb, write_mesh_ply
 from ..compute.threads import get_threads, host_threads
 from ..config import ExportConfig
 from ..engine.stages import StageContext
-from ..engine.tasks import Chunk
+from ..engine.tasks import Chunk, in_chunks
 from ..geometry.camera import project, resample_nearest
 from ..geometry.posed_depth import PosedDepth
 from ..mapping.measure import DrawnView, Shown, drawn_view
 from ..outcome import Outcome, load_outcome, maps_around
+from ..scene.world import World
 from ..system.lru_sequence import LruSequence
 from ..system.parallel import abreast
 from ..system.progress import Progress
 from ..system.values import load_value, save_value
-from ..types import VOID, Intrinsics, ProxyMaps
-from .planes import Planes, planes_of, straightened
-from .surface import Region, chunk_surfaces, weld
+from ..types import VOID
+from .extra.texture import make_textured, write_textured
+from .planes import Planes, planes_of, snap_to_planes
+from .surface import Region, chunk_surfaces, joined, weld
 from .volume import Grid, fuse, make_grid
 
 TRUNCATION = 3.0
@@ -39,9 +41,71 @@ SURE = 0.5
 _KEPT_BYTES = 100e6
 
 
+@dataclass(frozen=True)
+class MeshJob:
+    """Which `kinds` of the mesh ("mesh", "texture") go into a folder; a mesh.ply and mesh.glb that are there to `keep`
+    stay. The tasks are those of `context`, whose snapshot has what does not fit into memory."""
+
+    context: StageContext
+    kinds: tuple[str, ...]
+    folder: Path
+    keep: bool = False
+
+    @property
+    def scratch(self) -> Path:
+        """Folder of rendered views and finished regions."""
+        return _scratch(self.context)
+
+    @property
+    def ply(self) -> Path:
+        """Path of the mesh, which a texture needs too."""
+        return (self.folder if "mesh" in self.kinds else self.scratch) / "mesh.ply"
+
+
+def write_meshes(job: MeshJob, outcome: Outcome, world: World) -> list[Path]:
+    """Draw the map in the keyframes, snap uncertain depths to planes, fuse all region by region, join the regions, and
+    write what the job asks for, with a texture or without.
+
+    `outcome` has been moved, and may be without its map. Returns the paths written.
+    """
+    settings, names, axes = job.context.config.export, outcome.classes.names, world.gltf_from_exported
+    glb, count = job.folder / "mesh.glb", len(keyframe_rows(outcome))
+    views, is_made = drawn_views(job.scratch, count), job.keep and job.ply.exists()
+    if not is_made or "texture" in job.kinds:
+        in_chunks(job.context, draw_keyframes, count, move=outcome.move)
+        if settings.planes:
+            in_chunks(job.context, snap_views, count, planes=planes_in(job.scratch, count))
+    if not is_made:
+        grid = _grid_around(views, settings)
+        regions, class_ids = len(list(grid.regions())), tuple(outcome.label_of_channel.tolist())
+        in_chunks(job.context, fuse_views, regions, grid=grid, views=count, class_ids=class_ids)
+        # Regions are loaded one at a time, whenever `joined` goes over them.
+        whole = joined(lambda: (load_value(_region_file(job.scratch, n)) for n in range(regions)))
+        write_mesh_ply(job.ply, whole, names)
+    mesh = mesh_blocks(job.ply)
+    if "mesh" in job.kinds and mesh.face_count and not (job.keep and glb.exists()):
+        write_mesh_glb(glb, mesh, names, axes)
+    paths = [job.ply, glb][: 1 + (mesh.face_count > 0)] if "mesh" in job.kinds else []
+    if "texture" in job.kinds and mesh.face_count:
+        texture = make_textured(outcome, read_mesh_ply(job.ply), Shown(views), job.context.progress)
+        paths += write_textured(texture, names, job.folder, axes)
+    return paths
+
+
+def _scratch(context: StageContext) -> Path:
+    return context.snapshot / "mesh"
+
+
 def keyframe_rows(outcome: Outcome) -> list[int]:
     """The rows of the trajectory whose views the mesh is made from."""
     return np.flatnonzero(outcome.trajectory.is_keyframe).tolist()
+
+
+def draw_keyframes(task: Chunk, progress: Progress) -> None:
+    """Render the map in the keyframes of a chunk."""
+    context = task.context(progress)
+    outcome = load_outcome(task.run, context.device).moved(task.known["move"])
+    draw(outcome, task.config.export, _scratch(context), progress, task.numbers)
 
 
 def draw(outcome: Outcome, settings: ExportConfig, scratch: Path, progress: Progress, numbers: range) -> None:
@@ -54,27 +118,29 @@ def draw(outcome: Outcome, settings: ExportConfig, scratch: Path, progress: Prog
             row = rows[number]
             frame_id = int(t.frame_ids[row])
             view = drawn_view(near(frame_id), t.cam_from_world[row], camera)
-            maps = outcome.run.find_proxy(frame_id) if settings.planes else None
-            save_value(file, view if maps is None else replace(view, unsure=_unsure(maps, camera)))
+            if settings.planes and (maps := outcome.run.find_proxy(frame_id)) is not None:
+                view = replace(view, unsure=resample_nearest(maps.confidence, camera.height, camera.width) < SURE)
+            save_value(file, view)
 
     done = abreast(draw_one, numbers, host_threads(outcome.require_map().means))
     for _ in progress.track(done, "drawing", len(numbers)):
         pass
 
 
-def _unsure(maps: ProxyMaps, camera: Intrinsics) -> NDArray[np.bool_]:
-    return resample_nearest(maps.confidence, camera.height, camera.width) < SURE
+def snap_views(task: Chunk, progress: Progress) -> None:
+    """Move uncertain depths of a chunk's views onto the planes of all."""
+    snap(_scratch(task.context(progress)), task.known["planes"], progress, task.numbers)
 
 
-def straighten(scratch: Path, planes: Planes, progress: Progress, numbers: range) -> None:
-    """Move unsure depths of the views of `draw` onto the planes; a view that is done stays."""
+def snap(scratch: Path, planes: Planes, progress: Progress, numbers: range) -> None:
+    """Move uncertain depths of the views of `draw` onto the planes; a view that is done stays."""
 
-    def straighten_one(number: int) -> None:
+    def snap_one(number: int) -> None:
         view: DrawnView = load_value(file := _view_file(scratch, number))
         if view.unsure is not None:
-            save_value(file, straightened(view, planes))
+            save_value(file, snap_to_planes(view, planes))
 
-    done = abreast(straighten_one, numbers, get_threads())
+    done = abreast(snap_one, numbers, get_threads())
     for _ in progress.track(done, "straightening", len(numbers)):
         pass
 
@@ -96,46 +162,37 @@ def _view_file(scratch: Path, number: int) -> Path:
     return scratch / f"view_{number:06d}.npz"
 
 
-def make_grid_of(views: Sequence[DrawnView], settings: ExportConfig) -> Grid:
-    """Choose the voxel grid of the mesh, around what the views show."""
+def _grid_around(views: Sequence[DrawnView], settings: ExportConfig) -> Grid:
+    """The voxel grid around what the views show, by their median depth."""
     shown = Shown(views)
-    most = int(settings.max_blocks * max(len(views) / LONG, 1))
-    return make_grid(shown, settings.voxel * _median_depth(shown), TRUNCATION, most)
+    step = 16 * -(-len(shown) // LONG)
+    seen = np.concatenate([v.depth[v.trust > 0][::step] for v in shown])
+    median = float(np.median(seen)) if len(seen) else 1.0
+    return make_grid(shown, settings.voxel * median, TRUNCATION, int(settings.max_blocks * max(len(views) / LONG, 1)))
 
 
-def fuse_regions(
-    views: Sequence[DrawnView],
-    grid: Grid,
-    class_ids: tuple[int, ...],
-    scratch: Path,
-    progress: Progress,
-    numbers: range,
-) -> None:
-    """The surface of the map as the keyframes see it, in the grid's regions with these numbers, into `scratch`; what is
-    there stays. `class_ids`: the label of each class channel."""
+def fuse_views(task: Chunk, progress: Progress) -> None:
+    """The surface of the map as the keyframes see it, in some regions of the grid; what is there stays."""
+    scratch, known = _scratch(task.context(progress)), task.known
+    grid, views = known["grid"], drawn_views(scratch, known["views"])
     parts = list(grid.regions())
-    for number in numbers:
+    for number in task.numbers:
         if not (file := _region_file(scratch, number)).exists():
             of = f", {number + 1} of {len(parts)}" if len(parts) > 1 else ""
-            save_value(file, make_region(views, grid, class_ids, parts[number], progress, of))
-
-
-def fused_regions(scratch: Path, count: int) -> Callable[[], Iterable[Region]]:
-    """Return a function that loads the regions of `fuse_regions`, one in memory at a time."""
-    return lambda: (load_value(_region_file(scratch, number)) for number in range(count))
+            save_value(file, _region(views, grid, known["class_ids"], parts[number], progress, of))
 
 
 def _region_file(scratch: Path, number: int) -> Path:
     return scratch / f"region_{number:06d}.npz"
 
 
-def make_region(
+def _region(
     views: Sequence[DrawnView],
     grid: Grid,
     class_ids: tuple[int, ...],
     chunks: NDArray[np.int32],
     progress: Progress,
-    of: str = "",
+    of: str,
 ) -> Region:
     """One of the regions of the grid, from the views that see it; `of` names it for the progress."""
     near = grid.views_of(chunks)
@@ -144,12 +201,6 @@ def make_region(
     surface = weld(triangles, chunks, grid.voxel)
     painting = (views[n] for n in progress.track(near, "painting" + of, len(near)))
     return Region(surface, *paint(surface.vertices, painting, class_ids, 2 * grid.truncation))
-
-
-def _median_depth(views: Sequence[PosedDepth]) -> float:
-    step = 16 * -(-len(views) // LONG)
-    seen = np.concatenate([v.depth[v.trust > 0][::step] for v in views])
-    return float(np.median(seen)) if len(seen) else 1.0
 
 
 def mesh_figures(mesh: MeshBlocks) -> dict[str, int | float]:
@@ -194,27 +245,3 @@ def _seen(
     close = np.abs(view.depth[place[:, 1], place[:, 0]] - z[inside]) < tolerance
     close &= view.trust[place[:, 1], place[:, 0]] > 0
     return inside[close], (place[close, 1], place[close, 0])
-
-
-def draw_keyframes(task: Chunk, progress: Progress) -> None:
-    """Render the map in the keyframes of a chunk."""
-    context = task.context(progress)
-    outcome = load_outcome(task.run, context.device).moved(task.known["move"])
-    draw(outcome, task.config.export, scratch_of(context), progress, task.numbers)
-
-
-def straighten_views(task: Chunk, progress: Progress) -> None:
-    """Move the unsure depths of a chunk's views onto the planes of all."""
-    straighten(scratch_of(task.context(progress)), task.known["planes"], progress, task.numbers)
-
-
-def fuse_views(task: Chunk, progress: Progress) -> None:
-    """The surface in some regions of the grid."""
-    scratch, known = scratch_of(task.context(progress)), task.known
-    views = drawn_views(scratch, known["views"])
-    fuse_regions(views, known["grid"], known["class_ids"], scratch, progress, task.numbers)
-
-
-def scratch_of(context: StageContext) -> Path:
-    """Return the folder of rendered views and finished regions."""
-    return context.snapshot / "mesh"

@@ -14,6 +14,7 @@ from ...formats.atomic import copy_file
 from ...formats.errors import InputError, RecoverableError
 from ..config import Config
 from ..engine.stages import Stage, StageContext, run_stages
+from ..outcome import load_outcome
 from ..run.files import (
     BACKBONE,
     CALIBRATION,
@@ -30,6 +31,19 @@ from ..run.folder import RunFolder
 from ..run.journal import discard
 from ..run.records import load_records
 from ..system.progress import WithinStage
+from .writers import write_colmap, write_trajectory
+
+
+def write_pieces(context: StageContext) -> None:
+    """Make the pieces, and write piece_2 and so on: each with all the files of an export, or with its poses."""
+    for piece in make_pieces(context):
+        if "export" in (records := load_records(piece)):
+            for name in records["export"].files:
+                copy_file(piece.file("export", name), context.folder / piece.root.name / name)
+        elif "tracking" in records:
+            found = load_outcome(piece, context.device)
+            write_colmap(found, context.folder / piece.root.name)
+            write_trajectory(found, context.folder / piece.root.name)
 
 
 def make_pieces(context: StageContext) -> list[RunFolder]:

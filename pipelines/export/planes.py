@@ -1,7 +1,7 @@
 """Planes of a room: floor, walls, fronts, found among the voxels of its surface, and depths that move onto them.
 
 Planes are found by random hypotheses, largest first, and fitted again to what lies on them (RANSAC, Fischler and
-Bolles 1981). Uncertain depths then move onto the planes of sure ones beside them (`straightened`).
+Bolles 1981). Uncertain depths then move onto the planes of sure ones beside them (`snap_to_planes`).
 """
 
 from collections.abc import Sequence
@@ -128,8 +128,8 @@ def _sure_part(view: DrawnView) -> PosedDepth:
     return PosedDepth(small, shown.cam_from_world, depth, trust)
 
 
-def straightened(view: DrawnView, planes: Planes) -> DrawnView:
-    """Its unsure depths on the nearest plane that they lie along, along their rays; `unsure` is None then."""
+def snap_to_planes(view: DrawnView, planes: Planes) -> DrawnView:
+    """Put its uncertain depths on the nearest plane that they lie along, along their rays; `unsure` is None then."""
     if view.unsure is None:
         return view
     shown = view.shown

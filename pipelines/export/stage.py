@@ -2,26 +2,22 @@
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ...formats.atomic import copy_file
 from ...formats.digest import file_sha256
 from ...formats.gps import read_track
-from ...formats.mesh import mesh_blocks, read_mesh_ply, write_mesh_glb, write_mesh_ply
+from ...formats.mesh import mesh_blocks
 from ..config import Config, ExportConfig
 from ..engine.stages import Stage, StageContext
-from ..engine.tasks import in_chunks
-from ..mapping.measure import Shown
 from ..networks.registry import metric_card
 from ..networks.session import card_identity
 from ..outcome import Outcome, load_outcome
 from ..run.files import METRES, SUBMAPS
 from ..run.folder import RunFolder
 from ..run.journal import empty
-from ..run.records import load_records
 from ..scene.gps import AUTO, OFF, world_on_earth
 from ..scene.metres import find_metres
 from ..scene.upright import find_upright
@@ -31,30 +27,19 @@ from ..system.progress import Progress, SilentProgress
 from ..types import Metres
 from .extra.floor_plan import write_floor_plan
 from .extra.meshes import write_collision, write_usd
-from .extra.texture import make_textured, write_textured
 from .extra.tiles import write_tiles
 from .extra.web_page import write_web_page
-from .mesh import (
-    draw_keyframes,
-    drawn_views,
-    fuse_views,
-    fused_regions,
-    keyframe_rows,
-    make_grid_of,
-    mesh_figures,
-    planes_in,
-    scratch_of,
-    straighten_views,
-)
-from .pieces import make_pieces
-from .surface import joined
+from .mesh import MeshJob, mesh_figures, write_meshes
+from .pieces import write_pieces
 from .writers import write_colmap, write_notes, write_ply, write_readme, write_splats, write_trajectory, write_world
 
 
 def run(context: StageContext) -> dict[str, Any]:
-    """All files; a mesh that an interrupted attempt has finished is kept."""
-    found, settings = load_outcome(context.run, context.device), context.config.export
+    """Write all files of a run whose map is done; a mesh that an interrupted attempt has finished is kept."""
+    found, settings, folder = load_outcome(context.run, context.device), context.config.export, context.folder
     found.require_map()
+
+    # Which way is up, where on the Earth, and how many metres a unit is
     world, reasons = find_world(found, settings)
     for reason in reasons:
         context.warn(reason)
@@ -62,75 +47,24 @@ def run(context: StageContext) -> dict[str, Any]:
     outcome = on_earth(replace(found, metres=metres).moved(world.exported_from_run), world)
     del found  # one map is enough
     release_free_memory()
+
+    # Poses and splats; of each disconnected component all that is known of it
     write_pieces(context)
-    write_all_but_mesh(outcome, world, settings, context.folder)
+    write_all_but_mesh(outcome, world, settings, folder)
     if world.earth is not None:
-        METRES.save(context.folder, metres)
+        METRES.save(folder, metres)
     gaussians = len(outcome.require_map())
-    outcome = replace(outcome, gaussian_map=None)  # who draws it loads it
+
+    # The mesh, by tasks that load the map themselves
+    outcome = replace(outcome, gaussian_map=None)
     release_free_memory()
-    write_meshes(MeshJob(context, mesh_kinds(settings), context.folder, keep=True), outcome, world)
-    mesh = mesh_blocks(context.folder / "mesh.ply")
+    write_meshes(MeshJob(context, mesh_kinds(settings), folder, keep=True), outcome, world)
+    mesh = mesh_blocks(folder / "mesh.ply")
     if mesh.face_count == 0:
         context.warn("the mesh is empty: no surface is seen by enough keyframes")
-    return {
-        "images": int(outcome.trajectory.is_placed.sum()),
-        "gaussians": gaussians,
-        **mesh_figures(mesh),
-        **world_figures(world),
-        **metres_figures(metres),
-    }
 
-
-@dataclass(frozen=True)
-class MeshJob:
-    """Which `kinds` of the mesh ("mesh", "texture") go into a folder; a mesh.ply and mesh.glb that are there to `keep`
-    stay. The tasks are those of `context`, whose snapshot has what does not fit into memory."""
-
-    context: StageContext
-    kinds: tuple[str, ...]
-    folder: Path
-    keep: bool = False
-
-    @property
-    def scratch(self) -> Path:
-        """Folder of the snapshots of views and regions."""
-        return scratch_of(self.context)
-
-    @property
-    def ply(self) -> Path:
-        """Path of the mesh, which a texture needs too."""
-        return (self.folder if "mesh" in self.kinds else self.scratch) / "mesh.ply"
-
-    @property
-    def is_made(self) -> bool:
-        """Whether the mesh is there to stay."""
-        return self.keep and self.ply.exists()
-
-
-def write_meshes(job: MeshJob, outcome: Outcome, world: World) -> list[Path]:
-    """Write what the job asks for; `outcome` has been moved, and may be without its map."""
-    names, axes = outcome.classes.names, world.gltf_from_exported
-    glb, count = job.folder / "mesh.glb", len(keyframe_rows(outcome))
-    views = drawn_views(job.scratch, count)
-    if not job.is_made or "texture" in job.kinds:
-        in_chunks(job.context, draw_keyframes, count, move=outcome.move)
-        if job.context.config.export.planes:
-            in_chunks(job.context, straighten_views, count, planes=planes_in(job.scratch, count))
-    if not job.is_made:
-        grid = make_grid_of(views, job.context.config.export)
-        regions, class_ids = len(list(grid.regions())), tuple(outcome.label_of_channel.tolist())
-        in_chunks(job.context, fuse_views, regions, grid=grid, views=count, class_ids=class_ids)
-        write_mesh_ply(job.ply, joined(fused_regions(job.scratch, regions)), names)
-    mesh = mesh_blocks(job.ply)
-    if "mesh" in job.kinds and mesh.face_count and not (job.keep and glb.exists()):
-        write_mesh_glb(glb, mesh, names, axes)
-    paths = [job.ply, glb][: 1 + (mesh.face_count > 0)] if "mesh" in job.kinds else []
-    if "texture" in job.kinds and mesh.face_count:
-        whole = read_mesh_ply(job.ply)
-        texture = make_textured(outcome, whole, Shown(views), job.context.progress)
-        paths += write_textured(texture, names, job.folder, axes)
-    return paths
+    counts = {"images": int(outcome.trajectory.is_placed.sum()), "gaussians": gaussians}
+    return {**counts, **mesh_figures(mesh), **world_figures(world), **metres_figures(metres)}
 
 
 def mesh_kinds(settings: ExportConfig) -> tuple[str, ...]:
@@ -179,18 +113,6 @@ def export_inputs(source: Path, config: Config) -> dict[str, str] | None:
     metres = {} if card is None else {"metres": card_identity(card)}
     track = {} if config.export.gps in (AUTO, OFF) else {"track": file_sha256(Path(config.export.gps))}
     return metres | track or None
-
-
-def write_pieces(context: StageContext) -> None:
-    """piece_2 and so on: what nothing joins to the rest, each with all the files of an export, or with its poses."""
-    for piece in make_pieces(context):
-        if "export" in (records := load_records(piece)):
-            for name in records["export"].files:
-                copy_file(piece.file("export", name), context.folder / piece.root.name / name)
-        elif "tracking" in records:
-            found = load_outcome(piece, context.device)
-            write_colmap(found, context.folder / piece.root.name)
-            write_trajectory(found, context.folder / piece.root.name)
 
 
 def find_world(outcome: Outcome, settings: ExportConfig) -> tuple[World, list[str]]:

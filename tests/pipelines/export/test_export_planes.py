@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import ExportConfig
-from msgs_slam.pipelines.export.mesh import draw, drawn_views, keyframe_rows, planes_in, straighten
-from msgs_slam.pipelines.export.planes import Planes, find_planes, planes_of, straightened
+from msgs_slam.pipelines.export.mesh import draw, drawn_views, keyframe_rows, planes_in, snap
+from msgs_slam.pipelines.export.planes import Planes, find_planes, planes_of, snap_to_planes
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.geometry.voxels import Voxels
 from msgs_slam.pipelines.mapping.measure import DrawnView
@@ -53,7 +53,7 @@ def test_an_unsure_wall_becomes_straight() -> None:
     seen = views(truth + 1.8 * VOXEL * WAVES * MIDDLE, MIDDLE)
     planes = planes_of(seen)
     assert sorted(np.round(planes.normal, 2).tolist()) == [[0, -1, 0], [0, 0, -1]]
-    before, after = (np.abs(v.shown.depth - truth)[MIDDLE] for v in (seen[0], straightened(seen[0], planes)))
+    before, after = (np.abs(v.shown.depth - truth)[MIDDLE] for v in (seen[0], snap_to_planes(seen[0], planes)))
     assert np.percentile(before, 90) > VOXEL
     assert np.percentile(after, 90) < 0.1 * VOXEL
 
@@ -61,11 +61,11 @@ def test_an_unsure_wall_becomes_straight() -> None:
 def test_sure_depths_stay() -> None:
     seen = views(room() + 0.3 * VOXEL * WAVES, MIDDLE)
     planes, first = planes_of(seen), seen[0]
-    changed = straightened(first, planes).shown.depth != first.shown.depth
+    changed = snap_to_planes(first, planes).shown.depth != first.shown.depth
     assert changed[MIDDLE].mean() > 0.9
     assert not changed[~MIDDLE].any()
     sure = replace(first, unsure=np.zeros_like(MIDDLE))
-    np.testing.assert_array_equal(straightened(sure, planes).shown.depth, first.shown.depth)
+    np.testing.assert_array_equal(snap_to_planes(sure, planes).shown.depth, first.shown.depth)
 
 
 def test_a_step_of_four_voxels_stays() -> None:
@@ -73,7 +73,7 @@ def test_a_step_of_four_voxels_stays() -> None:
     seen = views(depth, MIDDLE)
     planes = planes_of(seen)
     assert len(planes.offset) == 2
-    np.testing.assert_array_equal(straightened(seen[1], planes).shown.depth, seen[1].shown.depth)
+    np.testing.assert_array_equal(snap_to_planes(seen[1], planes).shown.depth, seen[1].shown.depth)
 
 
 def test_a_plane_ends_where_others_are_sure_of_something_else() -> None:
@@ -81,7 +81,7 @@ def test_a_plane_ends_where_others_are_sure_of_something_else() -> None:
     depth = room() - 2 * VOXEL * MIDDLE
     seen = views(depth, np.zeros_like(MIDDLE))
     seen[0] = replace(seen[0], unsure=MIDDLE)
-    moved = np.abs(straightened(seen[0], planes_of(seen)).shown.depth - depth)
+    moved = np.abs(snap_to_planes(seen[0], planes_of(seen)).shown.depth - depth)
     inner = (np.abs(COLUMNS - 80) < 14) & (np.abs(ROWS - 50) < 8)
     assert moved[inner].max() < 0.1 * VOXEL
 
@@ -93,14 +93,14 @@ def test_a_ball_stays() -> None:
     ball = b**2 > a * c
     depth = np.where(ball, (b - np.sqrt(np.maximum(b**2 - a * c, 0))) / a, room())
     seen = [view(depth, ball, 0.0)] * 3
-    np.testing.assert_array_equal(straightened(seen[0], planes_of(seen)).shown.depth, seen[0].shown.depth)
+    np.testing.assert_array_equal(snap_to_planes(seen[0], planes_of(seen)).shown.depth, seen[0].shown.depth)
 
 
 def test_a_round_hall_gets_facets_of_less_than_two_voxels() -> None:
     """A sphere of forty voxels radius from inside, every other four columns unsure."""
     depth = 40 * VOXEL / np.sqrt((RAYS**2).sum(-1))
     seen = [view(depth, COLUMNS.astype(int) % 8 < 4, 0.0)] * 3
-    off = np.abs(straightened(seen[1], planes_of(seen)).shown.depth - depth)
+    off = np.abs(snap_to_planes(seen[1], planes_of(seen)).shown.depth - depth)
     assert off.max() < 2 * VOXEL
 
 
@@ -131,8 +131,8 @@ def test_views_of_a_run_are_made_straight_once(oracle_run: OracleRun, tmp_path: 
     draw(outcome, ExportConfig(mesh_side=80), tmp_path, SilentProgress(), range(count))
     assert drawn_views(tmp_path, count)[0].unsure is not None
     planes = planes_in(tmp_path, count)
-    straighten(tmp_path, planes, SilentProgress(), range(count))
+    snap(tmp_path, planes, SilentProgress(), range(count))
     done = {path: path.read_bytes() for path in tmp_path.glob("*.npz")}
     assert all(v.unsure is None for v in drawn_views(tmp_path, count))
-    straighten(tmp_path, planes_in(tmp_path, count), SilentProgress(), range(count))
+    snap(tmp_path, planes_in(tmp_path, count), SilentProgress(), range(count))
     assert done == {path: path.read_bytes() for path in tmp_path.glob("*.npz")}
