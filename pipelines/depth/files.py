@@ -28,6 +28,10 @@ _SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 _NAMES = ("depth",)
 _CONFIDENCE_NAMES = ("confidence", "conf")
 _INVALID_U16 = 65535
+NO_DEPTH = (
+    "the depth files hold no depth at all, every value is 0, 65535, negative, infinite or NaN. Look at what wrote "
+    "them, or omit --depth files"
+)
 
 
 class FilesDepth(DepthProvider):
@@ -88,6 +92,11 @@ class FilesDepth(DepthProvider):
     def turned(self) -> set[Path]:
         """Return the files of photos that are not read upright."""
         return {files[i] for files in (self._files, self._confidences) for i in self._turns if i in files}
+
+    def require_content(self) -> None:
+        """Raise InputError where no file holds any depth; files are read up to the first that does."""
+        if not any((self.estimate(f).depth > 0).any() for f in self._sequence.frames if f.id in self._files):
+            raise InputError(f"{self.name}: {NO_DEPTH}")
 
     def figures(self) -> dict[str, Any]:
         """Whether the folder had confidences too."""

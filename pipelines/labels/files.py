@@ -60,10 +60,10 @@ class FilesLabels(SemanticsProvider):
         for frame_id in self._progress.track(ids, "labels", len(ids)):
             counts += np.bincount(self._read(frame_id).ravel(), minlength=MAX_ID + 1)
         occurring = np.flatnonzero(counts).tolist()
-        table = self._table or {i: NamedClass(f"class {i}") for i in occurring if i not in (VOID, MAX_ID)}
+        table = self._table_of(occurring)
         kept = [i for i in occurring if i in table and not table[i].is_void]
         if not kept:
-            raise InputError(f"{self.name}: the label images hold no class at all, only void. Check the folder")
+            raise self._no_class()
         if len(kept) >= VOID:
             raise InputError(f"{self.name}: {len(kept)} classes occur, at most {VOID - 1} fit. Are these instance ids?")
         # 0 is the usual id of "nothing" in tables that do not name it.
@@ -73,6 +73,19 @@ class FilesLabels(SemanticsProvider):
         self._classes = ClassTable(
             tuple(table[i].name for i in kept), tuple(table[i].color or colors[k] for k, i in enumerate(kept))
         )
+
+    def require_content(self) -> None:
+        """Raise InputError where no image holds a class; images are read up to the first that does."""
+        found = (np.unique(self._read(i)).tolist() for i in self._files)
+        if not any(i in (table := self._table_of(ids)) and not table[i].is_void for ids in found for i in ids):
+            raise self._no_class()
+
+    def _table_of(self, ids: list[int]) -> dict[int, NamedClass]:
+        return self._table or {i: NamedClass(f"class {i}") for i in ids if i not in (VOID, MAX_ID)}
+
+    def _no_class(self) -> InputError:
+        what = f"the ids that {self._table_file} names" if self._table_file else "ids below 255"
+        return InputError(f"{self.name}: the label images hold no class at all, only void. Classes are {what}")
 
     def warnings(self) -> list[str]:
         """Return a warning of ids that are missing in the table of classes."""

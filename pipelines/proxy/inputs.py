@@ -53,8 +53,8 @@ def left_to_auto(config: Config) -> tuple[str, ...]:
 
 
 def check_proxy(source: Path, config: Config) -> None:
-    """InputError for a network that is not what its card says, a map of another shape than the images, and a scale
-    reference that makes no sense."""
+    """InputError for a network that is not what its card says, a map of another shape than the images, maps that
+    hold nothing, and a scale reference that makes no sense."""
     if config.proxy.scale_ref.strip() == POSES and not config.frames.poses:
         raise InputError("--scale-ref poses needs poses: give them with --poses FILE|FOLDER")
     if config.proxy.scale_ref:
@@ -73,6 +73,7 @@ def check_proxy(source: Path, config: Config) -> None:
     for provider in opened:
         if isinstance(provider, FilesDepth | FilesLabels):
             require_sizes(provider.files(), provider.turned(), around.sequence)
+            provider.require_content()
 
 
 def _digest_of(files: list[Path]) -> str:

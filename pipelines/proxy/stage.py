@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from ...formats.errors import InputError
+from ..depth.files import NO_DEPTH
 from ..depth.scale import DepthScale, measure_scale
 from ..depth.stereo.provider import MultiviewDepth
 from ..engine.stages import Stage, StageContext
@@ -40,6 +41,7 @@ def run(context: StageContext) -> dict[str, Any]:
     frames = _frames_to_do(work)
     _warn_of_missing(work, frames)
     _compute_depths(work, frames)
+    _warn_of_empty(work, frames)
     scale = measure_scale(work.sequence, frames, work.computed_depth)
     moving = _leave_out_moving(work, frames, scale)
     reference = reference_scale(context, work.sequence, frames, work.depths, scale, work.depth)
@@ -86,6 +88,22 @@ def _compute_depths(work: ProxyWork, frames: list[Frame]) -> None:
     in_frames(work, look_for_depth, frames)
     work.depths.fit(frames)
     in_frames(work, make_depths, frames, depths=dump_state(work.depths))
+
+
+def _warn_of_empty(work: ProxyWork, frames: list[Frame]) -> None:
+    """Of depth files in which nothing is known. Raises InputError where that is so of all keyframes."""
+    if not work.depths.name.startswith("files:"):
+        return
+    missing = {f.id for f in work.depths.missing(frames)}
+    read = [f for f in frames if f.id not in missing]
+    empty = [f for f in read if not (work.computed_depth(f).depth > 0).any()]
+    if read and len(empty) == len(read):
+        raise InputError(f"{work.depths.name}: of the keyframes {NO_DEPTH}")
+    if empty:
+        work.context.warn(
+            f"{len(empty)} of {len(read)} depth files hold no depth (every value is 0, 65535, negative, infinite or "
+            f"NaN), the first is that of {empty[0].name}: depth of these frames is unknown"
+        )
 
 
 def _compute_maps(work: ProxyWork, frames: list[Frame], scale: DepthScale, reference: ReferenceScale | None) -> None:

@@ -108,6 +108,16 @@ def eight_bits(folder: Path) -> str:
     return "files"
 
 
+def filled(folder: Path, kind: str, value: float, dtype: type) -> str:
+    for path in (folder / kind).iterdir():
+        if dtype is np.uint16:
+            write_grey_png(path, np.full((192, 256), value, np.uint16))
+        else:
+            np.save(path.with_suffix(".npy"), np.full((192, 256), value, dtype))
+            path.unlink()
+    return "files"
+
+
 def no_card(folder: Path) -> str:
     return f"onnx:{folder / 'card.toml'}"
 
@@ -130,6 +140,10 @@ def wrong_weights(folder: Path) -> str:
         (another_shape, "not the shape of the frames"),
         (one_of_another_shape, "000007.png is 100x100, which is not the shape"),
         (eight_bits, "depth"),
+        (lambda folder: filled(folder, "depth", 0, np.uint16), "hold no depth at all"),
+        (lambda folder: filled(folder, "depth", 65535, np.uint16), "hold no depth at all"),
+        (lambda folder: filled(folder, "depth", np.nan, np.float32), "hold no depth at all"),
+        (lambda folder: filled(folder, "depth", np.inf, np.float64), "hold no depth at all"),
         (no_card, r"no such file: .*card\.toml"),
         (no_weights, r"no net\.onnx beside the card"),
         (wrong_weights, "its inputs are x"),
@@ -144,3 +158,16 @@ def test_bad_input_is_refused_before_the_frames_are_picked(
     with pytest.raises(InputError, match=said):
         reconstruct(source, RunFolder(tmp_path / "run"), config, SilentProgress(), "proxy")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("has_table", [True, False])
+def test_labels_that_hold_only_void_are_refused_before_the_frames_are_picked(source: Path, has_table: bool) -> None:
+    files = sorted((source.parent / "labels").iterdir())
+    if not has_table:
+        (source.parent / "classes.json").unlink()
+    for path in files:
+        write_grey_png(path, np.full((192, 256), 0 if has_table else 255, np.uint8))
+    with pytest.raises(InputError, match="hold no class at all, only void"):
+        check_proxy(source, settings("multiview", "files"))
+    write_grey_png(files[-1], np.full((192, 256), 1, np.uint8))
+    check_proxy(source, settings("multiview", "files"))

@@ -10,6 +10,7 @@ import pytest
 from proxy_room import UNIT, Room
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import write_grey_png
 from msgs_slam.formats.textfile import read_json
 from msgs_slam.pipelines.depth.files import FilesDepth
 from msgs_slam.pipelines.engine.stages import StageContext
@@ -48,6 +49,21 @@ def test_files_become_maps_with_reliability(room: Room, make_context: Make) -> N
         assert classes.names[maps.labels[96, 128]] == f"kind {view.labels[96, 128]}"
     assert report["reliable_pixels"] > 0.9
     assert report["metres_per_unit"] == pytest.approx(1 / UNIT, rel=2e-3)
+
+
+def test_frames_whose_depth_files_hold_nothing_have_no_depth_and_are_counted(room: Room, make_context: Make) -> None:
+    context = make_context(*FILES)
+    folder = context.source.parent / "depth"
+    for frame in room.frames[2:4]:
+        write_grey_png(folder / frame.name, np.zeros((192, 256), np.uint16))
+    run(context)
+    assert any(f"2 of {len(room.frames)} depth files hold no depth" in w for w in context.warnings)
+    assert not context.run.load(PROXY_MAPS, of=room.frames[2].id).confidence.any()
+    none = make_context(*FILES, name="none")
+    for frame in room.frames:
+        write_grey_png(none.source.parent / "depth" / frame.name, np.zeros((192, 256), np.uint16))
+    with pytest.raises(InputError, match="of the keyframes the depth files hold no depth at all"):
+        run(none)
 
 
 def test_embedded_providers_go_end_to_end(room: Room, make_context: Make) -> None:
