@@ -7,10 +7,9 @@ import hashlib
 import os
 import platform
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Protocol
 
 from .errors import DiskFullError, InputError, RecoverableError
 from .reading import opened
@@ -22,28 +21,18 @@ _LONGEST_NAME = 255
 _AT_ONCE = 1 << 20
 
 
-class Watcher(Protocol):
-    """Observer of every file that is written atomically, in whatever thread."""
-
-    def writing(self, path: Path, temporary: Path) -> None:
-        """`temporary` is whole and takes the name `path` next."""
-
-    def written(self, path: Path) -> None:
-        """Note that the file `path` has been written."""
-
-
-_watchers: list[Watcher] = []
+_after_write: list[Callable[[Path], None]] = []
 _own_mark: list[str] = []
 
 
 @contextmanager
-def watched_by(watcher: Watcher) -> Iterator[None]:
-    """Report every file written inside this block to `watcher`."""
-    _watchers.append(watcher)
+def after_each_write(call: Callable[[Path], None]) -> Iterator[None]:
+    """Call a function with the path of every file that is written atomically inside this block, in any thread."""
+    _after_write.append(call)
     try:
         yield
     finally:
-        _watchers.remove(watcher)
+        _after_write.remove(call)
 
 
 def process_mark() -> str:
@@ -89,11 +78,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
         yield temporary
         _flush_to_disk(temporary)
-        for watcher in _watchers:
-            watcher.writing(path, temporary)
         os.replace(temporary, path)
-        for watcher in _watchers:
-            watcher.written(path)
+        for call in _after_write:
+            call(path)
     except OSError as error:
         if _is_of_another(error, path, temporary):
             raise RecoverableError(
@@ -112,6 +99,12 @@ def temporary_of(path: Path) -> Path:
     if len(os.fsencode(name)) > _LONGEST_NAME:
         name = f".{hashlib.sha256(os.fsencode(path.name)).hexdigest()}{end}"
     return path.with_name(name)
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Remove the temporary files that killed processes have left below a folder."""
+    for path in list(folder.rglob(".*.tmp*")):
+        path.unlink(missing_ok=True)
 
 
 def write_bytes(path: Path, data: bytes | bytearray | memoryview) -> None:

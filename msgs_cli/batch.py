@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -11,16 +13,18 @@ import click
 from .options import (
     FOLDER,
     UNTIL,
+    chosen_config,
     engine_options,
+    option_words,
     require_engine,
     settings_options,
     source_options,
-    source_settings,
 )
 from .output import Output, verbosity_options
 from .text import say
 
 if TYPE_CHECKING:
+    from ..pipelines.config import Config
     from ..pipelines.engine.placement import LocalPlacement, RayCluster
 
 
@@ -47,7 +51,7 @@ def batch(
     overrides: tuple[str, ...],
     until: str,
     output: Output,
-    **about_source: str | None,
+    **given: str | int | None,
 ) -> None:
     """Reconstruct every video, image folder and data set in FOLDER, a run each, and go on after failures.
 
@@ -58,17 +62,17 @@ def batch(
     require_engine(engine_name, address)
     from ..pipelines.batch import find_recordings, run_batch, table_row, write_table
     from ..pipelines.engine.tasks import Shard
-    from ..pipelines.read_config import load_config
 
-    texts = (*overrides, *source_settings(about_source))
     if placed:
-        _reconstruct_one(placed, out, config_file, texts, until, threads, output)
+        read = partial(chosen_config, config_file, overrides, given)
+        _reconstruct_one(placed, out, read, until, threads, output)
     recordings = find_recordings(folder.resolve(), out.resolve())
     mine = Shard.parse(shard).of(recordings)
-    config = load_config(config_file, texts)
+    config = chosen_config(config_file, overrides, given)
     out.mkdir(parents=True, exist_ok=True)
     placement, cpus, threads = _open_placement(engine_name, address, config.run.threads)
-    options = ["--until", until, "--threads", str(threads), *output.options, *(w for t in texts for w in ("--set", t))]
+    options = ["--until", until, "--threads", str(threads), *output.options, *option_words(given)]
+    options += [f"--set={text}" for text in overrides]
     options += [] if config_file is None else ["--config", str(config_file.resolve())]
     try:
         with output.stopping_softly("The same command goes on with it."):
@@ -88,23 +92,21 @@ def batch(
 
 
 def _reconstruct_one(
-    placed: tuple[str, str], out: Path, config_file: Path | None, texts: tuple[str, ...], until: str, threads: int,
+    placed: tuple[str, str], out: Path, read: Callable[[Config | None], Config], until: str, threads: int,
     output: Output,
 ) -> NoReturn:  # fmt: skip
     """Do the recording that a placement has started this process for; the one that started it says what became of
     it."""
-    from ..formats.textfile import read_toml
     from ..pipelines.batch import FAILED, Recording, reconstruct_one
     from ..pipelines.engine.placement import stop_with_parent
     from ..pipelines.system.progress import log
 
     name, source = placed
     stop_with_parent()
-    settings = read_toml(config_file) if config_file else {}
     log.info("%s: begins", name)
     recording = Recording(name, Path(source), out / f"{name}.msgs")
     with output.stopping_softly(""):
-        state = reconstruct_one(recording, settings, texts, output.progress(name), until, threads)
+        state = reconstruct_one(recording, read, output.progress(name), until, threads)
     log.info("%s: %s", name, state)
     sys.exit(int(state == FAILED))
 

@@ -28,13 +28,14 @@ from .options import (
     FOLDER,
     RUN_ARGUMENT,
     UNTIL,
+    chosen_config,
     cluster_workers,
     device_option,
     engine_options,
+    hold_out_option,
     open_run,
     settings_options,
     source_options,
-    source_settings,
 )
 from .output import Output, on_sigterm, verbosity_options
 from .summary import print_summary, tell_run
@@ -153,10 +154,7 @@ def main() -> None:
 @settings_options
 @source_options
 @UNTIL
-@click.option(
-    "--hold-out", type=click.IntRange(0), metavar="N",
-    help="Keep every N-th frame out of the map, to measure it there (evaluate). Default: 0, use all.",
-)  # fmt: skip
+@hold_out_option
 @engine_options("local: all in this process; ray: keyframes' depths and submaps on the nodes of a cluster.")
 @verbosity_options
 def reconstruct(
@@ -165,11 +163,10 @@ def reconstruct(
     config_file: Path | None,
     overrides: tuple[str, ...],
     until: str,
-    hold_out: int | None,
     engine_name: str,
     address: str,
     output: Output,
-    **about_source: str | None,
+    **given: str | int | None,
 ) -> None:
     """Reconstruct SOURCE, a video, a folder of images or a data set, into a run folder; of several videos by one camera
     of one place, one run.
@@ -177,14 +174,12 @@ def reconstruct(
     No option is needed. Stopped at any moment, the same command, or `msgs-slam resume RUN`, goes on where it was; with
     a changed setting only the stages that depend on it run again.
     """
-    from ..pipelines.read_config import load_config
     from ..pipelines.reconstruct import default_run_folder, existing_config, one_source
     from ..pipelines.reconstruct import reconstruct as run_reconstruct
     from ..pipelines.run.folder import RunFolder
 
     run = RunFolder(out) if out else default_run_folder(sources[0])
-    texts = source_settings(about_source | {"mapping__hold_out": hold_out})
-    config = load_config(config_file, [*overrides, *texts], base=existing_config(run))
+    config = chosen_config(config_file, overrides, given, existing_config(run))
     with (
         cluster_workers(engine_name, address, config, output) as workers,
         output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"),
@@ -213,21 +208,19 @@ def resume(
     engine_name: str,
     address: str,
     output: Output,
-    **about_source: str | None,
+    **given: str | int | None,
 ) -> None:
     """Resume RUN where it stopped. Finished stages are kept unless one of their settings is changed, or --redo names
     them. A stage that is made again replaces what it had left only when it ends well."""
     if redo and STAGES.index(redo) > STAGES.index(until):
         raise click.UsageError(f"--redo {redo} comes after --until {until}: nothing would be made again")
-    from ..pipelines.read_config import load_config
     from ..pipelines.reconstruct import require_run
     from ..pipelines.reconstruct import resume as run_resume
-    from ..pipelines.run.folder import RunFolder
-    from ..pipelines.run.settings_file import load_settings
+    from ..pipelines.run.folder import RunFolder, load_settings
 
     run = RunFolder(run_path)
     require_run(run)
-    config = load_config(config_file, [*overrides, *source_settings(about_source)], base=load_settings(run))
+    config = chosen_config(config_file, overrides, given, load_settings(run))
     with (
         cluster_workers(engine_name, address, config, output) as workers,
         output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"),
@@ -296,15 +289,14 @@ def demo(
     config_file: Path | None,
     overrides: tuple[str, ...],
     output: Output,
-    **about_source: str | None,
+    **given: str | int | None,
 ) -> None:
     """Reconstruct a short video of a made-up room, compare with its known truth, print the errors and where to look."""
     from ..pipelines.demo import demo_summary, run_demo
-    from ..pipelines.read_config import load_config
     from ..pipelines.reconstruct import reconstruct as run_reconstruct
     from ..pipelines.run.folder import RunFolder
 
-    config = load_config(config_file, [*overrides, *source_settings(about_source)])
+    config = chosen_config(config_file, overrides, given)
 
     def reconstruct_clip(video: Path, run: RunFolder) -> None:
         with output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"):

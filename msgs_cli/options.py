@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from ..pipelines.config import Option, settings_with_options
 from ..pipelines.run.names import STAGES
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 RUN_ARGUMENT = click.argument("run_path", metavar="RUN", type=click.Path(path_type=Path))
+_HOLD_OUT = "mapping.hold_out"
 UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], help="Stop after this stage.")
 
 
@@ -74,98 +76,53 @@ def cluster_workers(name: str, address: str, config: Config, output: Output) -> 
         cluster.close()
 
 
-_SOURCE_OPTIONS = {
-    "format": (
-        "run.format", "NAME",
-        "Kind of SOURCE: auto, images (a video or plain images, whatever is next to them), or a data set: 7scenes, "
-        "replica, tum, euroc, scannet, sens, nerfstudio, colmap, folder. Default: auto. A data set gives its times and "
-        "camera, and with --depth files --semantics files its depth and labels.",
-    ),
-    "device": ("run.device", "auto|cpu|cuda", "Where dense work runs. Default: auto."),
-    "depth": (
-        "proxy.depth", "PROVIDER",
-        "Proxy depth: auto, multiview (needs no weights), files[:FOLDER], onnx:CARD, or a network by its name in "
-        "`models list`. Default: auto.",
-    ),
-    "semantics": (
-        "proxy.semantics", "PROVIDER",
-        "Semantics: auto, segments (needs no weights), files[:FOLDER], onnx:CARD, or a network by its name. "
-        "Default: auto.",
-    ),
-    "classes": (
-        "proxy.classes", "WORDS",
-        'What to look for, "radiator, bookshelf, lamp", by a --semantics network whose card names a text encoder.',
-    ),
-    "intrinsics": (
-        "frames.intrinsics", "FX,FY,CX,CY[,K1,K2,P1,P2]|FILE",
-        "The camera, in pixels of the source (first pixel's centre at 0.5, 0.5). Default: the data set's, EXIF, else "
-        "self-calibrated.",
-    ),
-    "camera": (
-        "frames.camera", "auto|perspective|equirectangular|fisheye",
-        "Kind of camera: equirectangular for whole 360° panoramas, fisheye for a lens given by --intrinsics (k1 to k4 "
-        "of OpenCV's fisheye). Default: auto, from the source's metadata.",
-    ),
-    "poses": (
-        "frames.poses", "FILE|FOLDER",
-        "Camera poses by another program to start from: a COLMAP model, a transforms.json, ARKit's JSON, a TUM "
-        "trajectory or lines of 4x4 matrices. They need not be exact, nor all there.",
-    ),
-    "masks": (
-        "frames.masks", "FOLDER",
-        "Folder of masks: NAME.png for an image NAME, or the frame's number for a video. Black pixels are ignored.",
-    ),
-    "scale-ref": (
-        "proxy.scale_ref", "REF",
-        "Metres without metric depth: IMAGE:X1,Y1,X2,Y2=METRES, two pixels of one image, height=METRES, "
-        "or poses: those of --poses are in metres.",
-    ),
-    "scale": (
-        "export.scale", "auto|free",
-        "auto: estimate metres per unit where neither metric depth nor --scale-ref gives them; free: do not. Neither "
-        "rescales coordinates. Default: auto.",
-    ),
-    "gps": (
-        "export.gps", "FILE",
-        "Where it was taken, for files with x east, y north in metres: a GPX track, or a CSV with the columns time, "
-        "lat, lon, alt (a video counts from its start). Default: auto, the images' EXIF; off for neither.",
-    ),
-}  # fmt: skip
-"""Option → its setting, metavar, help."""
+def setting_option(key: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return a decorator that adds the option of a setting, as the table of settings describes it."""
+    known = settings_with_options()[key]
+    option: Option = known.metadata["option"]
+    return click.option(
+        f"--{option.name}", key.replace(".", "__"), type=int if isinstance(known.default, int) else str,
+        metavar=option.metavar or "|".join(known.metadata["choices"]), help=option.help or known.metadata["help"],
+    )  # fmt: skip
 
 
 def source_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that describe the source of a reconstruction; see `source_settings`."""
-    for name, (setting, metavar, help) in reversed(_SOURCE_OPTIONS.items()):
-        command = click.option(f"--{name}", setting.replace(".", "__"), metavar=metavar, help=help)(command)
+    """Add the options that describe the source of a reconstruction, and its results; see `chosen_config`."""
+    for key in reversed(settings_with_options()):
+        if key != _HOLD_OUT:
+            command = setting_option(key)(command)
     return command
 
 
-def device_option(command: Callable[..., None]) -> Callable[..., None]:
-    """--device of `source_options` alone; see `source_settings`."""
-    setting, metavar, help = _SOURCE_OPTIONS["device"]
-    return click.option("--device", setting.replace(".", "__"), metavar=metavar, help=help)(command)
+hold_out_option = setting_option(_HOLD_OUT)
+device_option = setting_option("run.device")
 
 
-def source_settings(given: Mapping[str, str | int | None]) -> list[str]:
-    """The options of `source_options`, and --hold-out, as `section.key="value"` texts.
+def chosen_config(
+    file: Path | None, overrides: Iterable[str], given: Mapping[str, str | int | None], base: Config | None = None
+) -> Config:
+    """Read the settings that a command line gives; raises SettingError, in the words that were typed.
 
-    Raises SettingError, in the words that were typed, for a value that one cannot have.
+    Args:
+        file: of --config.
+        overrides: of --set.
+        given: of the options of settings, by `section__key`; None where one is not given.
+        base: what holds where nothing is given; None for the defaults.
     """
-    from ..formats.errors import SettingError
-    from ..pipelines.read_config import load_config, toml_value
+    from ..pipelines.read_config import load_config, merge_settings
 
-    texts = []
-    for option, key in [*((name, row[0]) for name, row in _SOURCE_OPTIONS.items()), ("hold-out", "mapping.hold_out")]:
-        if (value := given.get(key.replace(".", "__"))) is None:
-            continue
-        text = f"{key}={toml_value(value)}"
-        try:
-            load_config(None, [text])
-        except SettingError as error:
-            raise SettingError(str(error).replace(f"--set {text}: {key}", f"--{option}")) from error
-        texts.append(text)
-    return texts
+    config = load_config(file, overrides, base)
+    for key, known in settings_with_options().items():
+        section, _, name = key.partition(".")
+        if (value := given.get(f"{section}__{name}")) is not None:
+            config = merge_settings(config, {section: {name: value}}, f"--{known.metadata['option'].name}")
+    return config
+
+
+def option_words(given: Mapping[str, str | int | None]) -> list[str]:
+    """The options of settings that were given, for the command line of another process."""
+    options = {key.replace(".", "__"): f.metadata["option"].name for key, f in settings_with_options().items()}
+    return [f"--{options[key]}={value}" for key, value in given.items() if value is not None]
 
 
 def open_run(path: Path) -> RunFolder:

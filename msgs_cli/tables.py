@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from ..pipelines.system.wording import figure_text
 
 if TYPE_CHECKING:
-    from ..pipelines.run.records import StageRecord
+    from ..pipelines.run.manifest import StageRecord
     from ..pipelines.status import StageStatus
 
 

@@ -28,7 +28,7 @@ def work(run_path: Path, shard: str, placed: bool, until: str, output: Output) -
     from ..pipelines.engine.placement import stop_with_parent
     from ..pipelines.engine.tasks import Shard
     from ..pipelines.reconstruct import work_on_run
-    from ..pipelines.run.settings_file import load_settings
+    from ..pipelines.run.folder import load_settings
 
     chosen, run = Shard.parse(shard), open_run(run_path)
     if placed:

@@ -7,7 +7,7 @@ any number of batches over the same folders may be started, killed and started a
 from __future__ import annotations
 
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,10 @@ from ..formats.images import VIDEO_SUFFIXES
 from ..formats.textfile import write_json
 from .config import Config
 from .engine.placement import Command, Placement
-from .read_config import load_config, merge_settings
 from .reconstruct import existing_config, reconstruct
-from .run.folder import RunFolder
+from .run.folder import RunFolder, load_records
 from .run.lock import RunBusyError
 from .run.names import STAGES
-from .run.records import load_records
 from .system.progress import Progress, log
 from .system.wording import markdown_table
 
@@ -133,19 +131,13 @@ def run_batch(
 
 
 def reconstruct_one(
-    recording: Recording,
-    settings: Mapping[str, Any],
-    overrides: tuple[str, ...],
-    progress: Progress,
-    until: str,
-    threads: int = 0,
+    recording: Recording, read: Callable[[Config | None], Config], progress: Progress, until: str, threads: int = 0
 ) -> str:
     """Reconstruct one recording in this process; it may be done twice, at any time, by any process.
 
     Args:
         recording: its source, and the folder of its run.
-        settings: of a file, by section, laid over those that the run has already.
-        overrides: `section.key=value`, laid over these.
+        read: lays the settings asked for over those that the run has already, if any.
         progress: shows how far it is.
         until: the last stage.
         threads: CPU threads where the settings leave them open, 0 for all.
@@ -155,8 +147,7 @@ def reconstruct_one(
     """
     try:
         run = RunFolder(recording.run)
-        base = merge_settings(existing_config(run) or Config(), settings, "the settings file")
-        reconstruct(recording.source, run, load_config(None, overrides, base), progress, until, threads=threads)
+        reconstruct(recording.source, run, read(existing_config(run)), progress, until, threads=threads)
     except RunBusyError:
         return ELSEWHERE
     except InputError as error:

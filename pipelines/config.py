@@ -6,17 +6,42 @@ from dataclasses import Field, dataclass, field, fields, is_dataclass
 from typing import Any
 
 
+@dataclass(frozen=True)
+class Option:
+    """An option of the command line that gives a setting: its name without dashes, what stands for its value, and its
+    help; without these the setting's own choices and help."""
+
+    name: str
+    metavar: str = ""
+    help: str = ""
+
+
 def setting(
     default: Any,
     help: str,
     choices: tuple[str, ...] = (),
     within: tuple[float, float] | None = None,
     or_zero: bool = False,
+    paths: tuple[str, ...] = (),
+    option: Option | None = None,
 ) -> Any:
-    """A dataclass field that carries its own help text and what it may be: one of `choices`, or a number `within` two
-    (both allowed) `or_zero`."""
-    allowed = {"choices": choices, "within": within, "or_zero": or_zero}
-    return field(default=default, metadata={"help": help, **allowed})
+    """A dataclass field that carries all that is known of it.
+
+    Args:
+        default: its value where nothing is given.
+        help: its meaning, for `msgs-slam config`.
+        choices: the texts that it may be.
+        within: the smallest and the largest number that it may be.
+        or_zero: whether it may be 0 beside these.
+        paths: what stands before the path of a file or folder that it may name, "" where it is the path alone.
+        option: of the command line.
+    """
+    return field(
+        default=default,
+        metadata={
+            "help": help, "choices": choices, "within": within, "or_zero": or_zero, "paths": paths, "option": option,
+        },
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -28,8 +53,17 @@ class RunConfig:
     format: str = setting(
         "auto", "layout of the source: a data set's; images = a video or plain images; auto looks",
         ("auto", "images", "7scenes", "replica", "tum", "euroc", "scannet", "sens", "nerfstudio", "colmap", "folder"),
+        option=Option(
+            "format", "NAME",
+            "Kind of SOURCE: auto, images (a video or plain images, whatever is next to them), or a data set: "
+            "7scenes, replica, tum, euroc, scannet, sens, nerfstudio, colmap, folder. Default: auto. A data set "
+            "gives its times and camera, and with --depth files --semantics files its depth and labels.",
+        ),
     )  # fmt: skip
-    device: str = setting("auto", "where dense work runs; auto takes a GPU if there is one", ("auto", "cpu", "cuda"))
+    device: str = setting(
+        "auto", "where dense work runs; auto takes a GPU if there is one", ("auto", "cpu", "cuda"),
+        option=Option("device", help="Where dense work runs. Default: auto."),
+    )  # fmt: skip
     memory_mb: int = setting(
         0, "plan with this much memory: given, long recordings are made in parts that fit. 0 = half of the machine's",
         within=(100, 10_000_000), or_zero=True,
@@ -50,12 +84,33 @@ class FramesConfig:
         or_zero=True,
     )
     max_side: int = setting(960, "longer images are reduced to this many pixels on the long side", within=(64, 8192))
-    intrinsics: str = setting("", "fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file; empty = find them")
+    intrinsics: str = setting(
+        "", "fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file; empty = find them",
+        paths=("",),
+        option=Option(
+            "intrinsics", "FX,FY,CX,CY[,K1,K2,P1,P2]|FILE",
+            "The camera, in pixels of the source (first pixel's centre at 0.5, 0.5). Default: the data set's, EXIF, "
+            "else self-calibrated.",
+        ),
+    )  # fmt: skip
     camera: str = setting(
         "auto", "auto: from the source's metadata; a panorama becomes six images, a fisheye of known lens one",
         ("auto", "perspective", "equirectangular", "fisheye"),
+        option=Option(
+            "camera",
+            help="Kind of camera: equirectangular for whole 360° panoramas, fisheye for a lens given by --intrinsics "
+            "(k1 to k4 of OpenCV's fisheye). Default: auto, from the source's metadata.",
+        ),
     )  # fmt: skip
-    poses: str = setting("", "poses to start from: a COLMAP model, transforms.json, ARKit's JSON, TUM or 4x4 lines")
+    poses: str = setting(
+        "", "poses to start from: a COLMAP model, transforms.json, ARKit's JSON, TUM or 4x4 lines",
+        paths=("",),
+        option=Option(
+            "poses", "FILE|FOLDER",
+            "Camera poses by another program to start from: a COLMAP model, a transforms.json, ARKit's JSON, a TUM "
+            "trajectory or lines of 4x4 matrices. They need not be exact, nor all there.",
+        ),
+    )  # fmt: skip
     rolling_shutter: str = setting(
         "auto", "seconds from a frame's first row to its last; auto finds them, where they explain something; off"
     )
@@ -70,7 +125,15 @@ class FramesConfig:
     loop_candidates: int = setting(
         4, "each keyframe is also matched with this many that look alike, for loops", within=(0, 1000)
     )
-    masks: str = setting("", "folder of masks, NAME.png for each image or some; black pixels are ignored")
+    masks: str = setting(
+        "", "folder of masks, NAME.png for each image or some; black pixels are ignored",
+        paths=("",),
+        option=Option(
+            "masks", "FOLDER",
+            "Folder of masks: NAME.png for an image NAME, or the frame's number for a video. Black pixels are "
+            "ignored.",
+        ),
+    )  # fmt: skip
     people: str = setting(
         "auto", "auto leaves people out where networks for them are in the cache; keep takes them for scene",
         ("auto", "keep"),
@@ -86,9 +149,32 @@ class FramesConfig:
 class ProxyConfig:
     """Proxy depth and semantics of every keyframe."""
 
-    depth: str = setting("auto", "depth provider: auto, multiview, files[:FOLDER], onnx:CARD, a network's name")
-    semantics: str = setting("auto", "semantics provider: auto, segments, files[:FOLDER], onnx:CARD, a network's name")
-    classes: str = setting("", "words to look for, comma-separated, for a network that compares images with words")
+    depth: str = setting(
+        "auto", "depth provider: auto, multiview, files[:FOLDER], onnx:CARD, a network's name",
+        paths=("files:", "onnx:"),
+        option=Option(
+            "depth", "PROVIDER",
+            "Proxy depth: auto, multiview (needs no weights), files[:FOLDER], onnx:CARD, or a network by its name "
+            "in `models list`. Default: auto.",
+        ),
+    )  # fmt: skip
+    semantics: str = setting(
+        "auto", "semantics provider: auto, segments, files[:FOLDER], onnx:CARD, a network's name",
+        paths=("files:", "onnx:"),
+        option=Option(
+            "semantics", "PROVIDER",
+            "Semantics: auto, segments (needs no weights), files[:FOLDER], onnx:CARD, or a network by its name. "
+            "Default: auto.",
+        ),
+    )  # fmt: skip
+    classes: str = setting(
+        "", "words to look for, comma-separated, for a network that compares images with words",
+        option=Option(
+            "classes", "WORDS",
+            'What to look for, "radiator, bookshelf, lamp", by a --semantics network whose card names a text '
+            "encoder.",
+        ),
+    )  # fmt: skip
     frames: str = setting("keyframes", "which frames get maps; all needs depth without poses", ("keyframes", "all"))
     max_side: int = setting(640, "the maps are at most this many pixels on the long side", within=(64, 8192))
     depth_scale: float = setting(0.001, "metres per unit of integer depth files", within=(1e-9, 1000))
@@ -97,7 +183,12 @@ class ProxyConfig:
         "what makes metres without metric depth: IMAGE:X1,Y1,X2,Y2=METRES, two pixels of one image of the source "
         "(an image's name or a video frame's number; the first pixel's centre is 0.5,0.5), height=METRES of the "
         "camera over the floor, or poses: those of frames.poses are in metres",
-    )
+        option=Option(
+            "scale-ref", "REF",
+            "Metres without metric depth: IMAGE:X1,Y1,X2,Y2=METRES, two pixels of one image, height=METRES, or "
+            "poses: those of --poses are in metres.",
+        ),
+    )  # fmt: skip
     fuse: str = setting(
         "learned",
         "which depth is fused with multi-view depth: a network's, and files no better than one; all; or none",
@@ -131,7 +222,11 @@ class MappingConfig:
         "every n-th frame is never used for the map, only to measure it; 0 = use all",
         within=(2, 1_000_000),
         or_zero=True,
-    )
+        option=Option(
+            "hold-out", "N",
+            "Keep every N-th frame out of the map, to measure it there (evaluate). Default: 0, use all.",
+        ),
+    )  # fmt: skip
     seed_stride: int = setting(2, "pixels between two new Gaussians where the map has a hole", within=(1, 64))
     passes: float = setting(9.0, "how often each keyframe is visited once all are seeded", within=(0, 1000))
     min_iterations: int = setting(400, "at least this many such visits in all", within=(0, 10_000_000))
@@ -168,7 +263,13 @@ class ExportConfig:
     gps: str = setting(
         "auto",
         "x east, y north, metres: auto by GPS in the images' EXIF, off, or a track (GPX, or CSV of time, lat, lon)",
-    )
+        paths=("",),
+        option=Option(
+            "gps", "FILE",
+            "Where it was taken, for files with x east, y north in metres: a GPX track, or a CSV with the columns "
+            "time, lat, lon, alt (a video counts from its start). Default: auto, the images' EXIF; off for neither.",
+        ),
+    )  # fmt: skip
     voxel: float = setting(0.008, "voxel of the mesh, in units of the scene's median depth", within=(0.0005, 1))
     max_blocks: int = setting(
         80000, "blocks of 8 x 8 x 8 voxels for 200 keyframes, more for more; voxels grow where that is too few",
@@ -182,7 +283,12 @@ class ExportConfig:
         "auto",
         "where metres are unknown, auto estimates how long a unit is, by a network and usual sizes; free does not",
         ("auto", "free"),
-    )
+        option=Option(
+            "scale",
+            help="auto: estimate metres per unit where neither metric depth nor --scale-ref gives them; free: do not. "
+            "Neither rescales coordinates. Default: auto.",
+        ),
+    )  # fmt: skip
     spz: bool = setting(False, "write the map as point_cloud.spz too")
     spz_version: int = setting(4, "version of that file; 3 for older readers", within=(3, 4))
     splat_glb: bool = setting(False, "write the map as point_cloud.glb too (glTF, KHR_gaussian_splatting)")
@@ -220,3 +326,9 @@ def config_to_dict(config: Any) -> dict[str, Any]:
         f.name: config_to_dict(value) if is_dataclass(value := getattr(config, f.name)) else value
         for f in fields(config)
     }
+
+
+def settings_with_options() -> dict[str, Field[Any]]:
+    """Find the settings that an option of the command line gives, by `section.key`."""
+    sections = {f.name: fields(getattr(Config(), f.name)) for f in fields(Config)}
+    return {f"{name}.{f.name}": f for name, known in sections.items() for f in known if f.metadata["option"]}

@@ -32,9 +32,8 @@ from .run.files import (
     SUBMAPS,
     TRAJECTORY,
 )
-from .run.folder import RunFolder
-from .run.records import StageRecord, load_records, load_source, recorded_config
-from .run.settings_file import load_settings
+from .run.folder import RunFolder, load_records, load_settings, load_source
+from .run.manifest import StageRecord, recorded_config
 from .system.device import resolve_device
 from .system.wording import quoted
 from .types import VOID, Calibration, ClassTable, Frame, Metres, Trajectory

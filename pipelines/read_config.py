@@ -15,10 +15,14 @@ from dataclasses import Field, fields, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from ..formats.errors import InputError, SettingError
+from ..formats.errors import SettingError
 from ..formats.reading import home_expanded, is_unicode
 from ..formats.textfile import read_toml
 from .config import Config, allowed_values, range_text
+
+
+class UnknownSettingError(SettingError):
+    """There is no setting of that name."""
 
 
 def load_config(file: Path | None = None, overrides: Iterable[str] = (), base: Config | None = None) -> Config:
@@ -28,50 +32,50 @@ def load_config(file: Path | None = None, overrides: Iterable[str] = (), base: C
     """
     config = base or Config()
     if file is not None:
-        config = merge_settings(config, read_toml(file), where=str(file))
+        config = merge_settings(config, read_toml(file), str(file))
     for text in overrides:
         key, separator, value = text.partition("=")
         section, dot, name = key.strip().partition(".")
         if not separator or not dot:
             raise SettingError(f"--set {text}: expected section.key=value, for example --set frames.rate=5")
-        config = merge_settings(config, {section: {name: _parse_value(value.strip())}}, where=f"--set {text}")
+        config = merge_settings(config, {section: {name: _parse_value(value.strip())}}, f"--set {text}")
     return config
 
 
-def merge_settings(config: Config, changes: Mapping[str, Any], where: str) -> Config:
-    """`config` with a mapping section → key → value laid over it; `where` names its source in errors."""
+def merge_settings(config: Config, changes: Mapping[str, Any], source: str) -> Config:
+    """Lay section → key → value over `config`. Raises SettingError, which names the `source`: a file, `--set ...`; of
+    an option of the setting's own, such as `--depth`, that is all."""
     sections = {f.name: getattr(config, f.name) for f in fields(config)}
     for section, values in changes.items():
         if not isinstance(values, Mapping):
-            raise SettingError(f"{where}: {section} is a section of settings, got {values!r:.80}")
+            raise SettingError(f"{source}: {section} is a section of settings, got {values!r:.80}")
         if section not in sections:
-            raise SettingError(f"{where}: there is no section {section!r}{nearest(section, sections)}")
-        sections[section] = _merge_section(sections[section], section, values, where)
+            raise UnknownSettingError(f"{source}: there is no section {section!r}{nearest(section, sections)}")
+        known = {f.name: f for f in fields(sections[section])}
+        for key, value in values.items():
+            if key not in known:
+                hint = nearest(key, known, section + ".")
+                raise UnknownSettingError(f"{source}: there is no setting {section}.{key}{hint}")
+            option = known[key].metadata["option"]
+            subject = source if option and source == f"--{option.name}" else f"{source}: {section}.{key}"
+            types = get_type_hints(type(sections[section]))
+            checked = _checked(value, types[key], known[key].metadata["choices"], subject)
+            _require_within(checked, known[key], subject)
+            sections[section] = replace(sections[section], **{key: checked})
     return Config(**sections)
 
 
-def merge_known_settings(config: Config, changes: Mapping[str, Any]) -> tuple[Config, list[str]]:
-    """Merge as `merge_settings`, but drop unknown names and invalid values; returns the dropped names too."""
+def merge_known_settings(config: Config, changes: Mapping[str, Any], source: str) -> tuple[Config, list[SettingError]]:
+    """Merge as `merge_settings`, but leave out what cannot be, of another version for example; returns the error of
+    each such setting too."""
     dropped = []
     for section, values in changes.items():
         for key, value in values.items() if isinstance(values, Mapping) else [("", values)]:
             try:
-                config = merge_settings(config, {section: {key: value}}, where="")
-            except InputError:
-                dropped.append(f"{section}.{key}")
+                config = merge_settings(config, {section: {key: value} if key else value}, source)
+            except SettingError as error:
+                dropped.append(error)
     return config, dropped
-
-
-def _merge_section(section: Any, name: str, values: Mapping[str, Any], where: str) -> Any:
-    types = get_type_hints(type(section))
-    known = {f.name: f for f in fields(section)}
-    checked = {}
-    for key, value in values.items():
-        if key not in known:
-            raise SettingError(f"{where}: there is no setting {name}.{key}{nearest(key, known, name + '.')}")
-        checked[key] = _checked(value, types[key], known[key].metadata["choices"], f"{where}: {name}.{key}")
-        _require_within(checked[key], known[key], f"{where}: {name}.{key}")
-    return replace(section, **checked)
 
 
 def _require_within(value: Any, known: Field[Any], where: str) -> None:
@@ -118,26 +122,18 @@ def config_to_toml(config: Config) -> str:
     return "\n".join(lines)
 
 
-_PATHS = {
-    "frames.intrinsics": "", "frames.poses": "", "frames.masks": "", "export.gps": "",
-    "proxy.depth": "files: onnx:", "proxy.semantics": "files: onnx:",
-}  # fmt: skip
-"""Settings that may name a file or folder → what stands before its path there."""
-
-
 def with_absolute_paths(config: Config) -> Config:
     """Make the paths of files and folders that are there absolute: a run goes on from any working folder."""
-    changes: dict[str, dict[str, str]] = {}
-    for key, beginnings in _PATHS.items():
-        section, _, name = key.partition(".")
-        text = getattr(getattr(config, section), name)
-        before = next((b for b in beginnings.split() if text.startswith(b)), None if beginnings else "")
-        if before is None or text in ("", before, "auto", "off"):
-            continue
-        path = os.path.abspath(home_expanded(text.removeprefix(before)))
-        if os.path.exists(path) or os.path.exists(path.rpartition("#")[0]):  # a file, or FILE#CAMERA
-            changes.setdefault(section, {})[name] = before + path
-    return merge_settings(config, changes, "paths")
+    for section in fields(config):
+        for f in fields(values := getattr(config, section.name)):
+            text = getattr(values, f.name)
+            prefix = next((p for p in f.metadata["paths"] if text.startswith(p)), None)
+            if prefix is None or text in ("", prefix, "auto", "off"):
+                continue
+            path = os.path.abspath(home_expanded(text.removeprefix(prefix)))
+            if os.path.exists(path) or os.path.exists(path.rpartition("#")[0]):  # a file, or FILE#CAMERA
+                config = merge_settings(config, {section.name: {f.name: prefix + path}}, f.name)
+    return config
 
 
 def toml_value(value: bool | int | float | str) -> str:

@@ -12,15 +12,15 @@ from ..formats.errors import InputError, RecoverableError
 from ..formats.reading import require_listable, require_unicode
 from ..formats.video import probe_video
 from .config import Config
-from .engine.stages import Stage, TaskWorkers, run_stages
+from .engine.runner import run_stages
+from .engine.stages import Stage, TaskWorkers
 from .engine.tasks import BETWEEN_LOOKS, Shard, SharedWorkers, boards_in, set_threads
 from .read_config import with_absolute_paths
-from .run.folder import RunFolder
+from .run.folder import RunFolder, load_records, load_settings, load_source
 from .run.lock import LEADER, LOCK, RunBusyError, locked, make_folder
+from .run.manifest import StageRecord, recorded_config
 from .run.names import SOURCE_LIST, STAGES
-from .run.records import StageRecord, load_records, load_source, recorded_config
 from .run.running import NotedProgress
-from .run.settings_file import load_settings
 from .source.opening import source_digest
 from .system.device import resolve_device
 from .system.limits import available_cpus

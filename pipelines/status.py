@@ -11,17 +11,16 @@ from typing import Any
 from ..formats.errors import InputError
 from .config import Config, ProxyConfig
 from .engine.stages import Stage
-from .engine.standing import newly_chosen, next_upstream, why_again
+from .engine.staleness import changed_auto_choices, next_upstream, rerun_reason
 from .masks.people import people_cards
 from .networks.card import Card
 from .networks.registry import ModelStore, metric_card
 from .proxy.selection import choose_depth, choose_semantics
 from .run.files import CALIBRATION
-from .run.folder import RunFolder
+from .run.folder import RunFolder, load_records, load_settings, load_source
+from .run.manifest import StageRecord, differing_settings
 from .run.names import STAGES
-from .run.records import StageRecord, differing_settings, load_records, load_source
 from .run.running import Running, load_running
-from .run.settings_file import load_settings
 from .sfm.window_size import window_size, windows_of
 from .system.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size
 from .system.wording import quoted
@@ -172,10 +171,10 @@ def _compared(
             inputs = stage.inputs(Path(origin.path), config) if stage.inputs else None
         except InputError:  # gone: it keeps what it was made from
             inputs = record.inputs
-        if why := why_again(stage, run, record, config, upstream, inputs):
+        if why := rerun_reason(stage, run, record, config, upstream, inputs):
             again[stage.name] = why
             break
-        newer[stage.name] = tuple(newly_chosen(stage, config, record, inputs))
+        newer[stage.name] = tuple(changed_auto_choices(stage, config, record, inputs))
         upstream = next_upstream(upstream, record)
     return again, newer
 
@@ -200,7 +199,7 @@ def about_new_networks(run: RunFolder, program: Sequence[Stage]) -> str:
         if (record := records.get(stage.name)) is None or not stage.auto(config):
             continue
         with suppress(InputError):  # files are gone, of which the run itself tells
-            newer = newly_chosen(stage, config, record, stage.inputs(source, config) if stage.inputs else None)
+            newer = changed_auto_choices(stage, config, record, stage.inputs(source, config) if stage.inputs else None)
             if networks := networks_chosen(newer):
                 added[stage.name] = networks
     if not added:

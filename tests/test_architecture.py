@@ -229,6 +229,7 @@ print(*(name if name.startswith("msgs_slam") else name.partition(".")[0] for nam
 """
 LIGHT = {
     "click", "msgs_slam", "msgs_slam.formats", "msgs_slam.formats.errors", "msgs_slam.pipelines",
+    "msgs_slam.pipelines.config",
     "msgs_slam.pipelines.run", "msgs_slam.pipelines.run.names", "msgs_slam.pipelines.system",
     "msgs_slam.pipelines.system.progress", "msgs_slam.pipelines.system.wording",
 }  # fmt: skip

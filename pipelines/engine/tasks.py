@@ -21,19 +21,18 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ...formats.atomic import own_temporaries, watched_by
+from ...formats.atomic import own_temporaries
 from ...formats.errors import InputError, RecoverableError
 from ...formats.textfile import read_json, write_json
 from ..config import Config
 from ..run.folder import RunFolder
-from ..run.journal import Journal
 from ..run.lock import take_lock
 from ..run.names import STAGES
 from ..system.identity import stage_file, stage_identity
 from ..system.progress import Progress
 from ..system.stopping import stop_if_asked
 from ..system.values import load_value, name_of, of_name, save_value
-from .stages import StageContext
+from .stages import StageContext, stopping_after_writes
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -233,7 +232,7 @@ class TaskBoard:
         set_threads(header["threads"])
         work, task = of_name(header["work"]), load_value(self.task(number))
         # On a disk without locks another process may do the same task.
-        with watched_by(Journal(folder)), own_temporaries():
+        with stopping_after_writes(folder), own_temporaries():
             try:
                 value = work(task, progress)
             except InputError as error:

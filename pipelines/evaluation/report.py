@@ -22,8 +22,7 @@ from ..geometry.sparse_model import SparseModel
 from ..outcome import Outcome, evenly, load_outcome
 from ..read_config import config_to_toml
 from ..run.files import FIGURES, LOOPS
-from ..run.folder import RunFolder
-from ..run.records import load_source
+from ..run.folder import RunFolder, load_source
 from ..scene.world import FIRST, WORLD
 from ..source.sharpness import at_most_wide
 from ..system.progress import Progress, SilentProgress

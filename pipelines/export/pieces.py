@@ -13,8 +13,10 @@ import numpy as np
 from ...formats.atomic import copy_file
 from ...formats.errors import InputError, RecoverableError
 from ..config import Config
-from ..engine.stages import Stage, StageContext, run_stages
+from ..engine.runner import run_stages
+from ..engine.stages import Stage, StageContext
 from ..outcome import load_outcome
+from ..run.ending import discard
 from ..run.files import (
     BACKBONE,
     CALIBRATION,
@@ -27,9 +29,7 @@ from ..run.files import (
     VOCABULARY,
     save_frames,
 )
-from ..run.folder import RunFolder
-from ..run.journal import discard
-from ..run.records import load_records
+from ..run.folder import RunFolder, load_records
 from ..system.progress import WithinStage
 from .writers import write_colmap, write_trajectory
 

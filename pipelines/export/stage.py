@@ -15,9 +15,9 @@ from ..engine.stages import Stage, StageContext
 from ..networks.registry import metric_card
 from ..networks.session import card_identity
 from ..outcome import Outcome, load_outcome
+from ..run.ending import empty
 from ..run.files import METRES, SUBMAPS
 from ..run.folder import RunFolder
-from ..run.journal import empty
 from ..scene.gps import AUTO, OFF, world_on_earth
 from ..scene.metres import find_metres
 from ..scene.upright import find_upright

@@ -33,8 +33,7 @@ from ..run.files import (
     VOCABULARY,
     save_frames,
 )
-from ..run.folder import RunFolder
-from ..run.records import load_records
+from ..run.folder import RunFolder, load_records
 from ..sfm.backbone import to_sparse_model
 from ..sfm.bridges import Picture
 from ..sfm.calibration import intrinsics_inputs, read_intrinsics

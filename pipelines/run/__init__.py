@@ -1,1 +1,1 @@
-"""A run's folder as a database: its files, records, journal, lock and settings."""
+"""A run's folder as a database: its files, manifest, settings and lock."""

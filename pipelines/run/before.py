@@ -21,10 +21,9 @@ from ...formats.errors import InputError
 from ...formats.textfile import read_json_object, write_json
 from ..types import Calibration, Frame
 from .files import BACKBONE, CALIBRATION, EXPOSURE, FRAMES, MAP, TRAJECTORY
-from .folder import RunFolder
-from .layouts import RunFile, dataclass_from_json, reading
+from .folder import RunFolder, load_source
 from .names import SOURCE_LIST
-from .records import load_source
+from .schema import RunFile, dataclass_from_json, reading
 
 if TYPE_CHECKING:
     from ..render.gaussian_map import GaussianMap

@@ -1,7 +1,7 @@
 """The end of a stage, in steps of which each may be the last one before a kill:
 
     1. its record, with the checksums of all results, is written into the unfinished folder: from here on it is finished
-    2. snapshot, stamp and journals are removed
+    2. snapshot and stamp are removed
     3. the folder of an earlier result is renamed aside and removed
     4. the unfinished folder takes the name of the stage
     5. the manifest names the stage
@@ -12,19 +12,21 @@ A later process that finds such a record takes the stage over if every file is a
 
 from __future__ import annotations
 
+import glob
 import os
 import shutil
+import time
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
+from ...formats.digest import file_sha256
 from ...formats.errors import InputError
 from ...formats.reading import parsing
 from ...formats.textfile import read_json_object, write_json
-from .finished_files import FinishedFiles
-from .journal import Journal, discard
-from .layouts import dataclass_from_json
-from .records import StageRecord, checksums, content_digest
+from .folder import RunFolder
+from .manifest import StageRecord, content_digest
+from .schema import dataclass_from_json
 
 FINGERPRINT, SNAPSHOT, RECORD = "fingerprint", "snapshot", ".record.json"
 """In an unfinished folder: the work that it belongs to, the folder of snapshots, the record of a stage that ended."""
@@ -32,7 +34,13 @@ FINGERPRINT, SNAPSHOT, RECORD = "fingerprint", "snapshot", ".record.json"
 
 def results(folder: Path) -> dict[str, tuple[int, str]]:
     """Relative path → (bytes, sha256) of every result in a stage's folder, finished or not."""
-    return checksums(folder, but=(FINGERPRINT, SNAPSHOT, RECORD, *(path.name for path in Journal(folder).files())))
+    return checksums(folder, but=(FINGERPRINT, SNAPSHOT, RECORD))
+
+
+def checksums(folder: Path, but: tuple[str, ...] = ()) -> dict[str, tuple[int, str]]:
+    """Relative path, with slashes, → (bytes, sha256) of every file below, but for the entries `but` of the folder."""
+    files = {p.relative_to(folder): p for p in sorted(folder.rglob("*")) if p.is_file() and not p.is_symlink()}
+    return {n.as_posix(): (p.stat().st_size, file_sha256(p)) for n, p in files.items() if n.parts[0] not in but}
 
 
 def seal(folder: Path, record: StageRecord) -> None:
@@ -40,7 +48,7 @@ def seal(folder: Path, record: StageRecord) -> None:
     write_json(folder / RECORD, asdict(record))
 
 
-def find_sealed(run: FinishedFiles, name: str, fingerprint: str) -> StageRecord | None:
+def find_sealed(run: RunFolder, name: str, fingerprint: str) -> StageRecord | None:
     """Find the record of a stage that ended without entering the manifest; None where there is none of this very work,
     or a file is not as it says."""
     for folder in (run.partial(name), run.stage(name)):
@@ -54,20 +62,19 @@ def find_sealed(run: FinishedFiles, name: str, fingerprint: str) -> StageRecord 
     return None
 
 
-def move_in(run: FinishedFiles, name: str) -> None:
+def move_in(run: RunFolder, name: str) -> None:
     """Give a sealed folder the name of its stage, in the place of an earlier result, unless that is done."""
     folder, target = run.partial(name), run.stage(name)
     if not (folder / RECORD).exists():
         return
     shutil.rmtree(folder / SNAPSHOT, ignore_errors=True)
-    for path in (folder / FINGERPRINT, *Journal(folder).files()):
-        path.unlink(missing_ok=True)
+    (folder / FINGERPRINT).unlink(missing_ok=True)
     discard(target)
     os.replace(folder, target)
     _flush_folder(run.root)
 
 
-def unseal(run: FinishedFiles, name: str) -> None:
+def unseal(run: RunFolder, name: str) -> None:
     """Remove the record from the folder of a stage that the manifest names."""
     with suppress(OSError):
         (run.stage(name) / RECORD).unlink(missing_ok=True)
@@ -75,7 +82,21 @@ def unseal(run: FinishedFiles, name: str) -> None:
 
 def _flush_folder(folder: Path) -> None:
     """Make a rename survive a power cut."""
-    if hasattr(os, "O_DIRECTORY"):
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-        os.fsync(descriptor)
-        os.close(descriptor)
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    os.fsync(descriptor)
+    os.close(descriptor)
+
+
+def discard(folder: Path) -> None:
+    """Remove a folder whose name is needed. It is renamed first: what other processes have open in it may stay on a
+    network disk for as long as they do, in a folder beside it that the next call removes."""
+    with suppress(FileNotFoundError):
+        folder.rename(folder.with_name(f".{folder.name}.old-{time.time_ns()}"))
+    for old in folder.parent.glob(f".{glob.escape(folder.name)}.old-*"):
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def empty(folder: Path) -> None:
+    """Make the folder, with nothing in it."""
+    discard(folder)
+    folder.mkdir(parents=True)

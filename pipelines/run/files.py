@@ -30,7 +30,7 @@ from ..types import (
     Trajectory,
     Vocabulary,
 )
-from .layouts import (
+from .schema import (
     RunFile,
     dataclass_from_json,
     require_increasing,

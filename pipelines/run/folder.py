@@ -1,7 +1,7 @@
-"""The run folder: the only module that knows paths inside a run.
+"""The run folder: where everything in a run lies, and whether it is as the program left it.
 
     video.msgs/
-      run.toml        the complete settings
+      run.toml        the complete settings; may be edited
       manifest.json   source; stage → fingerprint, files with sizes and checksums, settings, seconds, figures, warnings
       frames/  proxy/  tracking/  mapping/  global_ba/  export/
       <stage>.partial/   unfinished; renamed only when the stage ends well
@@ -12,7 +12,7 @@ into the folder of the running stage (`RunFile.save`). The table of the files is
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
 from itertools import count, takewhile
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
@@ -20,18 +20,133 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ...formats.atomic import write_text
+from ...formats.digest import file_sha256
+from ...formats.errors import InputError
 from ...formats.images import read_rgb
+from ...formats.textfile import read_toml
+from ..config import Config
+from ..read_config import UnknownSettingError, config_to_toml, merge_known_settings
+from ..system.progress import log
+from ..system.wording import quoted
 from ..types import Frame, ProxyMaps, any_of
 from .files import LEFT_OUT, PROXY_MAPS, SPARSE
-from .finished_files import FinishedFiles
-from .layouts import RunFile
+from .manifest import Manifest, Source, StageRecord, read_manifest, recorded_config
+from .names import EXTENSION, SOURCE_LIST
+from .schema import RunFile
 
 T = TypeVar("T")
+Stamp = tuple[int, int, int]
+"""Inode, bytes and time of change: another one means that the file may be another."""
+_FIRST_LINE = "# The settings of this run: edit them here, or give --set or --config to `msgs-slam resume`.\n"
+_LAST_LINE = "# End of run.toml.\n"
+
+
+def _stamp(path: Path) -> Stamp:
+    status = path.stat()
+    return status.st_ino, status.st_size, status.st_mtime_ns
 
 
 @dataclass(frozen=True)
-class RunFolder(FinishedFiles):
+class RunFolder:
     """One run on disk: what its finished stages have left."""
+
+    root: Path
+    _manifest: dict[Stamp, Manifest] = field(default_factory=dict, init=False, compare=False, repr=False)
+    _digests: dict[Path, tuple[Stamp, str]] = field(default_factory=dict, init=False, compare=False, repr=False)
+
+    def stage(self, name: str) -> Path:
+        """Folder of a finished stage."""
+        return self.root / name
+
+    def partial(self, name: str) -> Path:
+        """Folder of an unfinished stage."""
+        return self.root / f"{name}.partial"
+
+    @property
+    def settings_file(self) -> Path:
+        return self.root / "run.toml"
+
+    @property
+    def manifest_file(self) -> Path:
+        return self.root / "manifest.json"
+
+    @property
+    def evaluation_file(self) -> Path:
+        return self.root / "evaluation" / "evaluation.json"
+
+    @property
+    def report_file(self) -> Path:
+        return self.root / "report.html"
+
+    def manifest(self) -> Manifest | None:
+        """None before there is any. Raises InputError for a damaged one."""
+        if not self.manifest_file.exists():
+            return None
+        stamp = _stamp(self.manifest_file)
+        if stamp not in self._manifest:
+            manifest = read_manifest(self.manifest_file)
+            self._manifest.clear()
+            self._manifest[stamp] = manifest
+        return self._manifest[stamp]
+
+    def has(self, stage: str, name: str) -> bool:
+        """Whether the finished stage has left a file of that name, be it there still or not."""
+        manifest = self.manifest()
+        if manifest is None:
+            return (self.stage(stage) / name).exists()
+        return stage in manifest.records and name in manifest.records[stage].files
+
+    def file(self, stage: str, name: str) -> Path:
+        """A file of a finished stage, for reading.
+
+        Its checksum is taken when it is first used, and again when its inode, size or time of change is another: a
+        megabyte takes a millisecond, which is less than anything that is done with it takes. Raises InputError when
+        it is not as the stage left it. Without a manifest there is nothing to compare with, and no command goes on.
+        """
+        path, manifest = self.stage(stage) / name, self.manifest()
+        if manifest is None:
+            return path
+        if stage not in manifest.records:
+            raise InputError(f"{self.root}: {stage} is not done. Run `msgs-slam resume {quoted(self.root)}` first")
+        expected = manifest.records[stage].files.get(name)
+        if expected is None or not self._is_intact(path, *expected):
+            what = "is gone" if not path.is_file() else "is not as the program left it: damaged or changed"
+            raise InputError(
+                f"{path} {what}. Run `msgs-slam resume {quoted(self.root)}`: {stage} and what follows are made again"
+            )
+        return path
+
+    def damaged(self, stage: str) -> list[str]:
+        """Names of the files of a finished stage that are gone or not as it left them. Reads all of them. Those of the
+        pieces, runs inside the run, count for the export, which makes them."""
+        manifest = self.manifest()
+        files = manifest.records[stage].files if manifest and stage in manifest.records else {}
+        own = [name for name, expected in files.items() if not self._is_intact(self.stage(stage) / name, *expected)]
+        names = {name.partition("/")[0] for name in files if stage == "export" and name.startswith("piece_")}
+        return own + [f"../{name}/{file}" for name in sorted(names) for file in RunFolder(self.root / name)._wrong()]
+
+    def _wrong(self) -> list[str]:
+        """The same over all stages, inside the run."""
+        if (manifest := self.manifest()) is None:
+            return [self.manifest_file.name]
+        return [f"{stage}/{name}" for stage in manifest.records for name in self.damaged(stage)]
+
+    @property
+    def is_piece(self) -> bool:
+        """Whether this is a run inside another one."""
+        return self.root.name.startswith("piece_") and RunFolder(self.root.parent).manifest_file.exists()
+
+    def _is_intact(self, path: Path, size: int, digest: str) -> bool:
+        try:
+            stamp = _stamp(path)
+            if stamp[1] != size or not path.is_file():
+                return False
+            if (known := self._digests.get(path)) is None or known[0] != stamp:
+                known = self._digests[path] = (stamp, file_sha256(path))
+        except OSError:
+            return False
+        return known[1] == digest
 
     def load(self, file: RunFile[T], stage: str = "", of: int | str = "", piece: str = "") -> T:
         """Load a file of the run's table (`run/files.py`) as a stage, without one the file's first, left it; `of` which
@@ -70,3 +185,63 @@ class RunFolder(FinishedFiles):
 def _place(file: RunFile[T], stage: str, of: int | str, piece: str) -> tuple[str, str]:
     """The stage, and the file's name in its folder."""
     return stage or file.stages[0], str(PurePosixPath(piece, file.name.format(of)))
+
+
+def load_records(run: RunFolder) -> dict[str, StageRecord]:
+    """The finished stages by name."""
+    manifest = run.manifest()
+    return {} if manifest is None else dict(manifest.records)
+
+
+def load_source(run: RunFolder) -> Source:
+    """Load the source of a run. Raises InputError for a folder that is not a run."""
+    manifest = run.manifest()
+    source = read_manifest(run.manifest_file).source if manifest is None else manifest.source
+    path = Path(source.path)
+    if path.name != SOURCE_LIST:
+        return source
+    # The list of several videos is in the run, wherever that has been moved to.
+    folder = run.root / path.parent.name if path.parent.name.startswith(EXTENSION) else run.root
+    return replace(source, path=str(folder / SOURCE_LIST)) if (folder / SOURCE_LIST).is_file() else source
+
+
+def save_settings(run: RunFolder, config: Config) -> None:
+    """Write run.toml, atomically, where it holds other settings. Raises InputError when the disk refuses."""
+    text = _FIRST_LINE + config_to_toml(config) + _LAST_LINE
+    if not run.settings_file.exists() or load_settings(run) != config:
+        write_text(run.settings_file, text)
+
+
+def load_settings(run: RunFolder) -> Config:
+    """Load the settings with which the run goes on; the file may have been edited.
+
+    Where it is gone, what the finished stages were made with is taken, and defaults for the others. Raises InputError
+    where none is finished, for a file that is cut short, and for values that a setting cannot have.
+    """
+    file = run.settings_file
+    if not file.exists():
+        if not (records := load_records(run)):
+            raise InputError(
+                f"{run.root} was stopped before its settings were written, or {file.name} is gone, and "
+                f"nothing is finished: run `msgs-slam reconstruct {quoted(load_source(run).path)} "
+                f"--out {quoted(run.root)}` with the options it had"
+            )
+        log.warning("%s is gone: stages that are not done get default settings", file)
+        return recorded_config(records, Config())
+    try:
+        values = read_toml(file)
+        is_complete = all(f.name in values.get(name, {}) for name, s in vars(Config()).items() for f in fields(s))
+        if not is_complete and _LAST_LINE.encode().strip() not in file.read_bytes():
+            raise InputError(f"{file} is cut short, for its last line is missing ({_LAST_LINE.strip()})")
+        config, dropped = merge_known_settings(Config(), values, str(file))
+        for error in dropped:
+            if not isinstance(error, UnknownSettingError):
+                raise error
+    except InputError as error:
+        raise InputError(
+            f"{error}. Correct it, or delete it and run `msgs-slam resume {quoted(run.root)}`: what the finished "
+            "stages were made with is kept in manifest.json"
+        ) from error
+    for unknown in dropped:  # of another version of the program, or mistyped
+        log.warning("%s: it is ignored", unknown)
+    return config

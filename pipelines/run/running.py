@@ -15,8 +15,8 @@ from ...formats.errors import InputError
 from ...formats.textfile import read_json
 from ..system.progress import BEGUN, Progress, StageEvent, about
 from .folder import RunFolder
-from .layouts import dataclass_from_json
 from .lock import is_led
+from .schema import dataclass_from_json
 
 T = TypeVar("T")
 FILE = ".progress.json"

@@ -15,7 +15,7 @@ from ...formats.errors import InputError
 from ...formats.gps import Track, enu_from_geodetic, photo_places, read_track
 from ..geometry.se3 import Similarity
 from ..outcome import Outcome
-from ..run.records import load_source
+from ..run.folder import load_source
 from ..source.opening import FolderSource, open_source
 from ..system.progress import log
 from .world import Georeference, World

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..geometry.se3 import Similarity
 from ..outcome import Outcome
-from ..run.layouts import RunFile, dataclass_from_json
+from ..run.schema import RunFile, dataclass_from_json
 from .upright import Upright, cameras_up
 
 Array = NDArray[np.float64]

@@ -18,9 +18,9 @@ from ..config import Config, FramesConfig
 from ..frames.learned import open_learned, picture_features
 from ..run.before import FINAL, save_before
 from ..run.files import CALIBRATION, SPARSE
-from ..run.folder import RunFolder
+from ..run.folder import RunFolder, load_records, load_source
+from ..run.manifest import Manifest, Source, write_manifest
 from ..run.names import EXTENSION, SOURCE_LIST, STAGES
-from ..run.records import Manifest, Source, load_records, load_source, write_manifest
 from ..sfm.calibration import read_intrinsics
 from ..sfm.lens import Lens, calibrated_camera, make_lens, to_pycolmap
 from ..source.opening import VideoSource, open_source, source_digest, video_files

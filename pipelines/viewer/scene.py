@@ -22,8 +22,7 @@ from ..outcome import Outcome, evenly, labels_of_channels, load_outcome, map_clo
 from ..providers import class_colors
 from ..render.gaussian_map import decided_channels
 from ..run.files import BACKBONE, CALIBRATION, FRAMES, MESH
-from ..run.folder import RunFolder
-from ..run.records import load_records
+from ..run.folder import RunFolder, load_records
 from ..scene.upright import cameras_up
 from ..scene.world import WORLD, up_in_run
 from ..types import Frame, Intrinsics, Metres

@@ -166,6 +166,8 @@ def main() -> None:
         other = options.other / file
         if damage is replace and not other.is_file():
             continue
+        if file == "run.toml" and damage in (flip, replace):
+            continue  # which may be what the user wants
         shutil.rmtree(damaged, ignore_errors=True)
         shutil.copytree(options.run, damaged)
         if damage is not None:

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.gps import enu_from_geodetic, photo_places
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import load_source
+from msgs_slam.pipelines.run.folder import RunFolder, load_source
 from msgs_slam.pipelines.scene.gps import georeference
 from msgs_slam.pipelines.scene.world import WORLD
 from msgs_slam.pipelines.source.opening import FolderSource, open_source

@@ -40,9 +40,8 @@ from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import all_stages, reconstruct, resume
-from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder, load_settings
 from msgs_slam.pipelines.run.names import STAGES
-from msgs_slam.pipelines.run.settings_file import load_settings
 from msgs_slam.pipelines.system.identity import stage_identity
 from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.world import ClipOptions, iter_clip, make_world

@@ -35,8 +35,7 @@ from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import load_records
+from msgs_slam.pipelines.run.folder import RunFolder, load_records
 from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.benchmarks.ablate import ABLATIONS as ARTICLE_ABLATIONS
 

@@ -18,11 +18,12 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines import batch
 from msgs_slam.pipelines.batch import DONE, ELSEWHERE, FAILED, Recording, find_recordings, reconstruct_one
+from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.placement import Command, CommandResult
 from msgs_slam.pipelines.engine.tasks import Shard
-from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.read_config import load_config, merge_settings
+from msgs_slam.pipelines.run.folder import RunFolder, load_settings
 from msgs_slam.pipelines.run.lock import locked
-from msgs_slam.pipelines.run.settings_file import load_settings
 from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.pipelines.frames.conftest import QUICK, render, sideways
 
@@ -70,7 +71,10 @@ def test_a_failure_costs_itself_only_and_a_second_call_does_what_is_left(recordi
 
 
 def reconstruct_here(recording: Recording, **settings: object) -> str:
-    return reconstruct_one(recording, settings, QUICK, SilentProgress(), "frames")
+    def read(base: Config | None) -> Config:
+        return load_config(None, QUICK, merge_settings(base or Config(), settings, "test"))
+
+    return reconstruct_one(recording, read, SilentProgress(), "frames")
 
 
 def test_what_another_process_works_on_is_left_to_it(recordings: Path, tmp_path: Path) -> None:

@@ -15,10 +15,9 @@ from msgs_slam.formats.video_writer import write_video
 from msgs_slam.msgs_cli.main import KindOfFile, main
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.reconstruct import existing_config
-from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder, save_settings
+from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
 from msgs_slam.pipelines.run.names import EXPORTS
-from msgs_slam.pipelines.run.records import Manifest, Source, write_manifest
-from msgs_slam.pipelines.run.settings_file import save_settings
 
 
 def invoke(*arguments: object) -> Result:
@@ -225,24 +224,25 @@ def emptied(run: RunFolder) -> None:
     run.settings_file.write_text("")
 
 
-def edited(run: RunFolder) -> None:
-    run.settings_file.write_text(run.settings_file.read_text().replace("rate = 10.0", "rate = 5.0"))
+def cut_short(run: RunFolder) -> None:
+    text = run.settings_file.read_text()
+    run.settings_file.write_text(text[: text.index("[export]")])
 
 
-def of_another_run(run: RunFolder) -> None:
-    other = run_of(run.root.parent / "other", digest="1")
-    run.settings_file.write_bytes(other.settings_file.read_bytes())
+def out_of_range(run: RunFolder) -> None:
+    run.settings_file.write_text(run.settings_file.read_text().replace("rate = 10.0", "rate = -5.0"))
 
 
-@pytest.mark.parametrize("spoil", [emptied, edited, of_another_run])
-def test_settings_not_as_they_were_left_are_refused(spoil: Callable[[RunFolder], None], tmp_path: Path) -> None:
+@pytest.mark.parametrize("spoil", [emptied, cut_short, out_of_range])
+def test_settings_that_cannot_be_are_refused(spoil: Callable[[RunFolder], None], tmp_path: Path) -> None:
     run = run_of(tmp_path / "run")
     spoil(run)
     for command in ("resume", "status", "report", "render", "export"):
         result = invoke(command, run.root, *([tmp_path / "out.mp4"] if command == "render" else []))
         assert result.exit_code == 1, (command, result.output)
         assert isinstance(result.exception, SystemExit)
-        assert "run.toml is not as the program left it" in result.stderr
+        assert "run.toml" in result.stderr
+        assert "Correct it, or delete it and run" in result.stderr
         assert f"msgs-slam resume {run.root}" in result.stderr
 
 

@@ -9,8 +9,7 @@ import pytest
 from cli_runs import invoke
 
 from msgs_slam.msgs_cli.tables import format_table
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import load_records
+from msgs_slam.pipelines.run.folder import RunFolder, load_records
 from msgs_slam.pipelines.system.wording import figure_text, lost_text, stretches
 
 USED_BY = {
@@ -88,7 +87,7 @@ def test_progress_and_errors_as_json_lines(copied_run: Callable[[str], Path]) ->
     (run / "run.toml").write_text("")
     refused = invoke("resume", run, "--log-format", "json")
     assert refused.exit_code == 1
-    assert "not as the program left it" in json.loads(refused.stderr)["message"]
+    assert "run.toml is empty" in json.loads(refused.stderr)["message"]
     logging.getLogger().handlers.clear()
 
 

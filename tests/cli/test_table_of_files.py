@@ -5,10 +5,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from msgs_slam.pipelines.run import files
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.layouts import RunFile
+from msgs_slam.pipelines.run.folder import RunFolder, load_records
 from msgs_slam.pipelines.run.names import STAGES
-from msgs_slam.pipelines.run.records import load_records
+from msgs_slam.pipelines.run.schema import RunFile
 
 ROWS: list[RunFile] = [*files.FIGURES.values(), *(row for row in vars(files).values() if isinstance(row, RunFile))]
 FOR_OTHERS = re.compile(r"\d+\.jpg|timestamps\.txt")

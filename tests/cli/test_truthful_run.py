@@ -15,9 +15,8 @@ from cli_runs import OPTIONS, FinishedRun, invoke
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.reconstruct import made_with, reconstruct
-from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder, load_records
 from msgs_slam.pipelines.run.lock import locked
-from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.source.opening import source_digest
 from msgs_slam.pipelines.system.progress import SilentProgress
 

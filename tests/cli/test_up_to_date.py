@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from cli_runs import QUICK, FinishedRun, files_below, invoke
 
-from msgs_slam.pipelines.engine import standing
+from msgs_slam.pipelines.engine import staleness
 from msgs_slam.pipelines.networks.registry import ModelStore
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import Manifest, load_records, load_source, write_manifest
+from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_source
+from msgs_slam.pipelines.run.manifest import Manifest, write_manifest
 from tests.cli.test_models_commands import write_network
 
 
@@ -127,9 +127,9 @@ def test_a_network_that_is_added_later_makes_nothing_again(
 def test_status_says_what_another_version_would_make_again(
     copied_run: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run, right = copied_run("run.msgs"), standing.stage_identity
+    run, right = copied_run("run.msgs"), staleness.stage_identity
     assert json.loads(invoke("status", run, "--json").stdout)["warnings"] == []
-    monkeypatch.setattr(standing, "stage_identity", lambda n, f: "new" if n == "global_ba" else right(n, f))
+    monkeypatch.setattr(staleness, "stage_identity", lambda n, f: "new" if n == "global_ba" else right(n, f))
     before = contents(run)
     said = " ".join(invoke("status", run).stdout.split())
     assert "global_ba was made otherwise (another version of the program made it" in said

@@ -8,8 +8,7 @@ from pathlib import Path
 from cli_runs import invoke
 
 from msgs_slam.formats.digest import file_sha256
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import load_records
+from msgs_slam.pipelines.run.folder import RunFolder, load_records
 
 DIVIDED = ("--set", "mapping.submap=5", "--until", "mapping", "-q")
 

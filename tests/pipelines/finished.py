@@ -3,17 +3,9 @@
 from collections.abc import Iterable
 
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import (
-    Manifest,
-    Source,
-    StageRecord,
-    checksums,
-    content_digest,
-    settings_of,
-    write_manifest,
-)
-from msgs_slam.pipelines.run.settings_file import save_settings
+from msgs_slam.pipelines.run.ending import checksums
+from msgs_slam.pipelines.run.folder import RunFolder, save_settings
+from msgs_slam.pipelines.run.manifest import Manifest, Source, StageRecord, content_digest, settings_of, write_manifest
 
 
 def note_finished(

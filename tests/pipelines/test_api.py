@@ -19,9 +19,7 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.trajectory import read_tum
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.run.files import FRAMES
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import load_records
-from msgs_slam.pipelines.run.settings_file import load_settings
+from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings
 from msgs_slam.pipelines.system.identity import source_digest
 from msgs_slam.pipelines.system.progress import SilentProgress, StageEvent
 from tests.pipelines.frames.conftest import QUICK, render, sideways

@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.msgs_cli.options import source_settings
+from msgs_slam.msgs_cli.options import chosen_config
 from msgs_slam.pipelines.config import Config, FramesConfig, ProxyConfig, config_to_dict
 from msgs_slam.pipelines.read_config import (
     config_to_toml,
@@ -37,12 +37,12 @@ def test_every_text_is_read_back_as_it_was_written(masks: str, words: str, poses
         Config(), frames=FramesConfig(masks=masks, poses=poses), proxy=ProxyConfig(classes=words)
     )
     assert merge_settings(Config(), tomllib.loads(config_to_toml(config)), "") == config
-    assert load_config(None, source_settings({"frames__masks": masks, "frames__poses": poses})).frames == config.frames
+    assert chosen_config(None, (), {"frames__masks": masks, "frames__poses": poses}).frames == config.frames
 
 
 def test_text_that_no_file_can_hold_is_refused() -> None:
     with pytest.raises(InputError, match=r"--masks is no valid UTF-8.*rename the file or folder"):
-        source_settings({"frames__masks": "K\udcfcche"})
+        chosen_config(None, (), {"frames__masks": "K\udcfcche"})
     with pytest.raises(InputError, match=r"frames\.masks is no valid UTF-8"):
         load_config(overrides=["frames.masks=K\udcfcche"])
 

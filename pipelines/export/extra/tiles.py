@@ -17,7 +17,7 @@ from ....formats.gaussians import GaussianCloud, isotropic_cloud
 from ....formats.gps import ecef_from_enu
 from ....formats.textfile import write_json
 from ...outcome import Outcome
-from ...run.journal import empty
+from ...run.ending import empty
 from ...scene.world import Z_UP_FROM_Y_DOWN, World
 
 Array = NDArray[np.float64]

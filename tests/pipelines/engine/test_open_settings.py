@@ -14,9 +14,8 @@ from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import made_with
-from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.folder import RunFolder, load_settings
 from msgs_slam.pipelines.run.names import STAGES
-from msgs_slam.pipelines.run.settings_file import load_settings
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 

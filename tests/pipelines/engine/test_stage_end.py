@@ -13,13 +13,12 @@ import pytest
 from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.errors import DiskFullError
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.stages import Stage, StageContext, run_stages
+from msgs_slam.pipelines.engine.runner import run_stages
+from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.run import journal
-from msgs_slam.pipelines.run.ending import RECORD, find_sealed
-from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.ending import RECORD, discard, empty, find_sealed
+from msgs_slam.pipelines.run.folder import RunFolder, load_records
 from msgs_slam.pipelines.run.names import STAGES
-from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 CALLS = ("replace", "rename", "unlink", "rmdir", "mkdir", "fsync", "open")
@@ -129,7 +128,7 @@ def interrupted(root: Path, monkeypatch: pytest.MonkeyPatch, *settings: str, **c
 
     config = load_config(overrides=settings)
     with monkeypatch.context() as patch:
-        patch.setattr("msgs_slam.pipelines.engine.stages.move_in", stop)
+        patch.setattr("msgs_slam.pipelines.engine.runner.move_in", stop)
         with pytest.raises(KeyboardInterrupt):
             Stages().bring(root, config, **changes)
 
@@ -164,7 +163,7 @@ def test_a_disk_that_is_full_for_the_manifest_costs_no_stage(tmp_path: Path, mon
     def full(*_: object) -> None:
         raise DiskFullError("no room")
 
-    stages = Stages(lambda: monkeypatch.setattr("msgs_slam.pipelines.engine.stages.write_manifest", full))
+    stages = Stages(lambda: monkeypatch.setattr("msgs_slam.pipelines.engine.runner.write_manifest", full))
     with pytest.raises(DiskFullError):
         stages.bring(tmp_path / "r")
     monkeypatch.undo()
@@ -192,7 +191,7 @@ def test_files_that_a_network_disk_keeps_for_others_stop_nothing(
         assert Stages().bring(tmp_path / "r", load_config(overrides=[OTHER])) == ["mapping"]
         (tmp_path / "r" / "proxy" / "folder" / "0.txt").unlink()
         assert Stages().bring(tmp_path / "r", load_config(overrides=[OTHER])) == ["proxy", "tracking", "mapping"]
-        journal.empty(tmp_path / "r" / "proxy")
+        empty(tmp_path / "r" / "proxy")
         assert not list((tmp_path / "r" / "proxy").iterdir())
-    journal.discard(tmp_path / "r" / "mapping")
+    discard(tmp_path / "r" / "mapping")
     assert not list((tmp_path / "r").glob(".mapping*"))

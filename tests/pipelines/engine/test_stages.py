@@ -9,12 +9,11 @@ import pytest
 from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.errors import DiskFullError, InputError
 from msgs_slam.pipelines.config import Config, MappingConfig
-from msgs_slam.pipelines.engine.stages import SameSource, Stage, StageContext, run_stages
+from msgs_slam.pipelines.engine.runner import run_stages
+from msgs_slam.pipelines.engine.stages import SameSource, Stage, StageContext
 from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.journal import Journal
+from msgs_slam.pipelines.run.folder import RunFolder, load_records
 from msgs_slam.pipelines.run.names import STAGES
-from msgs_slam.pipelines.run.records import load_records
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 
@@ -121,57 +120,6 @@ def test_interrupted_stage_keeps_its_snapshot(recorder: Recorder, tmp_path: Path
     assert bring_up_to_date(recorder, tmp_path / "r") == ["mapping", "global_ba", "export"]
     assert not list(run.root.glob("*.partial"))
     assert not list(run.root.rglob(".torn*"))
-
-
-def test_damaged_snapshot_is_dropped_and_what_is_whole_stays(
-    recorder: Recorder, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    recorder.fail_in = "mapping"
-    with pytest.raises(KeyboardInterrupt):
-        bring_up_to_date(recorder, tmp_path / "r")
-    snapshot = RunFolder(tmp_path / "r").partial("mapping") / "snapshot" / "half.txt"
-    with pytest.raises(KeyboardInterrupt):
-        bring_up_to_date(recorder, tmp_path / "r")
-    assert "damaged" not in caplog.text
-    snapshot.write_text("hulf")
-    (snapshot.parent / "foreign.txt").write_text("of nobody")
-    with pytest.raises(KeyboardInterrupt):
-        bring_up_to_date(recorder, tmp_path / "r")
-    assert (
-        "1 files of the interrupted attempt are damaged and made again, the first is snapshot/half.txt" in caplog.text
-    )
-    assert [p.name for p in snapshot.parent.iterdir()] == ["half.txt"]
-    assert snapshot.read_text() == "half"
-
-
-def test_file_that_the_disk_has_cut_is_not_sealed(recorder: Recorder, tmp_path: Path) -> None:
-    class Cutting(Recorder):
-        def make(self, name: str) -> Any:
-            whole = super().make(name)
-
-            def run(context: StageContext) -> dict[str, Any]:
-                figures = whole(context)
-                if name == "proxy":
-                    (context.folder / "result.txt").write_text("so")
-                return figures
-
-            return run
-
-    with pytest.raises(InputError, match="is not what was written there"):
-        bring_up_to_date(Cutting(), tmp_path / "r")
-    assert list(load_records(RunFolder(tmp_path / "r"))) == ["frames"]
-    assert bring_up_to_date(recorder, tmp_path / "r") == list(STAGES[1:])
-
-
-def test_line_of_the_journal_that_a_full_disk_has_cut_costs_no_other_file(recorder: Recorder, tmp_path: Path) -> None:
-    recorder.fail_in = "mapping"
-    with pytest.raises(KeyboardInterrupt):
-        bring_up_to_date(recorder, tmp_path / "r")
-    (journal,) = Journal(RunFolder(tmp_path / "r").partial("mapping")).files()
-    with journal.open("a") as file:
-        file.write("\n0123456789abcdef")
-    recorder.fail_in = ""
-    assert bring_up_to_date(recorder, tmp_path / "r") == ["mapping", "global_ba", "export"]
 
 
 def test_nothing_is_given_up_for_a_source_that_is_another_one(recorder: Recorder, tmp_path: Path) -> None:

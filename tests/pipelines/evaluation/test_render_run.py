@@ -19,8 +19,8 @@ from msgs_slam.pipelines.demo import TRUTH, VIDEO, demo_summary, run_demo, unpac
 from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.render_run import film_seconds, render_run
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import Manifest, Source, load_records, write_manifest
+from msgs_slam.pipelines.run.folder import RunFolder, load_records
+from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
 from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.world import make_world, render_frame
 from tests.world.demo_clip import OPTIONS, pack_clip

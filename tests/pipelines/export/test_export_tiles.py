@@ -129,15 +129,11 @@ def test_a_full_disk_leaves_nothing_half_written(
 ) -> None:
     run, folder, _ = written
 
-    class Full:
-        def writing(self, path: Path, temporary: Path) -> None:
-            if path.name == "tile01.glb":
-                raise OSError(28, "No space left on device", str(path))
+    def fill(path: Path) -> None:
+        if path.name == "tile01.glb":
+            raise OSError(28, "No space left on device", str(path))
 
-        def written(self, path: Path) -> None:
-            pass
-
-    with atomic.watched_by(Full()), pytest.raises(DiskFullError):
+    with atomic.after_each_write(fill), pytest.raises(DiskFullError):
         export_run(run, folder.parent, "tiles")
     assert not folder.exists()
 

@@ -19,8 +19,8 @@ from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.reconstruct import one_source, source_digest
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import Manifest, Source, load_source, write_manifest
+from msgs_slam.pipelines.run.folder import RunFolder, load_source
+from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
 from msgs_slam.pipelines.source.opening import FolderSource, VideoSource, open_source
 
 

@@ -22,7 +22,7 @@ from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, SPARSE
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.layouts import dataclass_from_json
+from msgs_slam.pipelines.run.schema import dataclass_from_json
 from msgs_slam.pipelines.sfm import driver as sfm
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
 from msgs_slam.pipelines.sfm.window_size import windows_of

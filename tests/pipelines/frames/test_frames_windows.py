@@ -15,9 +15,10 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
 from msgs_slam.pipelines.read_config import load_config
+from msgs_slam.pipelines.run.ending import checksums
 from msgs_slam.pipelines.run.files import CALIBRATION
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import Manifest, Source, StageRecord, checksums, write_manifest
+from msgs_slam.pipelines.run.manifest import Manifest, Source, StageRecord, write_manifest
 from msgs_slam.pipelines.sfm.adjust import adjust, reprojection_errors
 from msgs_slam.pipelines.sfm.consistency import judge
 from msgs_slam.pipelines.sfm.lens import unknown_camera

@@ -26,7 +26,7 @@ from msgs_slam.pipelines.mapping.submaps import BORDER, divide, nearest_seeing
 from msgs_slam.pipelines.outcome import load_outcome, maps_around
 from msgs_slam.pipelines.run.files import DEPTH_FIELDS, MAP, SUBMAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.layouts import RunFile
+from msgs_slam.pipelines.run.schema import RunFile
 from msgs_slam.pipelines.system.memory import LEAST_SUBMAP, submap_size
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Intrinsics

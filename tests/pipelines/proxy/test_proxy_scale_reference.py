@@ -64,7 +64,7 @@ def test_bad_references_are_refused_before_anything_slow(
     make_context: Make, tmp_path: Path, text: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = make_context().source
-    monkeypatch.setattr("msgs_slam.pipelines.engine.stages._run_one", lambda *_: pytest.fail("a stage was run"))
+    monkeypatch.setattr("msgs_slam.pipelines.engine.runner._run_one", lambda *_: pytest.fail("a stage was run"))
     config = load_config(overrides=[setting(text), "run.device=cpu"])
     with pytest.raises(InputError, match=said):
         reconstruct(source, RunFolder(tmp_path / "new"), config, SilentProgress())

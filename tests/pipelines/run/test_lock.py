@@ -13,10 +13,9 @@ from typing import IO
 import pytest
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.run import lock_file
+from msgs_slam.pipelines.run import lock
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import LEADER, RunBusyError, is_led, locked
-from msgs_slam.pipelines.run.lock_file import SILENT, leading
+from msgs_slam.pipelines.run.lock import LEADER, SILENT, RunBusyError, is_led, leading, locked
 
 
 @pytest.fixture
@@ -52,7 +51,7 @@ def test_an_error_of_the_leader_gives_the_lead_up(run: RunFolder) -> None:
 LEADS = """
 import os, sys
 from pathlib import Path
-from msgs_slam.pipelines.run.lock_file import leading
+from msgs_slam.pipelines.run.lock import leading
 with leading(Path(sys.argv[1])) as led:
     os._exit(0 if led else 1)
 """
@@ -83,7 +82,7 @@ def test_another_machine_is_dead_when_it_is_silent(tmp_path: Path) -> None:
 
 
 def test_a_leader_that_was_taken_for_dead_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lock_file, "BEAT", 0.01)
+    monkeypatch.setattr(lock, "BEAT", 0.01)
     with leading(tmp_path / LEADER):
         (tmp_path / LEADER).write_text("another's")
         with pytest.raises(KeyboardInterrupt):
@@ -92,7 +91,7 @@ def test_a_leader_that_was_taken_for_dead_stops(tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_leader_gives_signs_of_life(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lock_file, "BEAT", 0.01)
+    monkeypatch.setattr(lock, "BEAT", 0.01)
     with leading(tmp_path / LEADER):
         os.utime(tmp_path / LEADER, (0, 0))
         while (tmp_path / LEADER).stat().st_mtime == 0:

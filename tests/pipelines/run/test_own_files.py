@@ -8,8 +8,8 @@ import pytest
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.tensors import load_arrays
 from msgs_slam.formats.textfile import MAX_JSON_BYTES, read_json
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import Manifest, Source, StageRecord, load_records, write_manifest
+from msgs_slam.pipelines.run.folder import RunFolder, load_records
+from msgs_slam.pipelines.run.manifest import Manifest, Source, StageRecord, write_manifest
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 

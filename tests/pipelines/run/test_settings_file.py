@@ -10,10 +10,7 @@ from finished import note_finished
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config, ExportConfig
-from msgs_slam.pipelines.read_config import config_to_toml
-from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.records import load_records, load_source
-from msgs_slam.pipelines.run.settings_file import load_settings, save_settings
+from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings, load_source
 
 
 @pytest.fixture
@@ -24,27 +21,44 @@ def run(tmp_path: Path) -> RunFolder:
     return run
 
 
-def test_a_setting_that_is_no_more_does_not_stop_a_run(
-    run: RunFolder, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As a version would leave it that still had one: with its checksum."""
-    config = replace(Config(), export=ExportConfig(voxel=0.05))
-    text = config_to_toml(config).replace("[frames]\n", "[frames]\npeak_threshold = 0.01\n")
-    monkeypatch.setattr("msgs_slam.pipelines.run.settings_file.config_to_toml", lambda _: text)
-    save_settings(run, config)
+def edit(run: RunFolder, old: str, new: str) -> None:
+    text = run.settings_file.read_text()
+    assert old in text
+    run.settings_file.write_text(text.replace(old, new))
+
+
+def test_the_file_may_be_edited(run: RunFolder) -> None:
+    edit(run, "voxel = 0.008", "voxel = 0.05  # coarser")
+    assert load_settings(RunFolder(run.root)) == replace(Config(), export=ExportConfig(voxel=0.05))
+
+
+def test_a_setting_that_is_no_more_does_not_stop_a_run(run: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
+    edit(run, "[frames]\n", "[frames]\npeak_threshold = 0.01\nrat = 3\n")
     with caplog.at_level(logging.WARNING):
-        assert load_settings(RunFolder(run.root)) == config
-    assert "1 settings in it are none any more (frames.peak_threshold)" in caplog.text
-    run.settings_file.write_text(
-        run.settings_file.read_text().replace("peak_threshold = 0.01", "peak_threshold = 0.02")
-    )
-    with pytest.raises(InputError, match="not as the program left it"):
+        assert load_settings(RunFolder(run.root)) == Config()
+    assert "there is no setting frames.peak_threshold" in caplog.text
+    assert "there is no setting frames.rat; did you mean frames.rate?: it is ignored" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("voxel = 0.008", "voxel = 8", r"export\.voxel .*0\.0005 to 1.*Correct it, or delete it and run"),
+        ("voxel = 0.008", "voxel = ", "delete it and run `msgs-slam resume"),
+    ],
+)
+def test_a_value_that_cannot_be_and_a_file_cut_short_are_refused(
+    run: RunFolder, old: str, new: str, reason: str
+) -> None:
+    edit(run, old, new)
+    with pytest.raises(InputError, match=reason):
         load_settings(RunFolder(run.root))
-
-
-def test_settings_without_their_checksum_are_refused(run: RunFolder) -> None:
-    run.settings_file.write_text(run.settings_file.read_text().partition("\n")[2])
-    with pytest.raises(InputError, match="not as the program left it"):
+    text = run.settings_file.read_text()
+    run.settings_file.write_text(text[: text.index("[export]")])
+    with pytest.raises(InputError, match="cut short"):
+        load_settings(RunFolder(run.root))
+    run.settings_file.write_text("")
+    with pytest.raises(InputError, match=r"run\.toml is empty"):
         load_settings(RunFolder(run.root))
 
 

@@ -12,7 +12,8 @@ import torch
 
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.pipelines.config import Config, ExportConfig, GlobalBaConfig, MappingConfig, ProxyConfig
-from msgs_slam.pipelines.engine.stages import StageContext, run_stages
+from msgs_slam.pipelines.engine.runner import run_stages
+from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.mapping import growth

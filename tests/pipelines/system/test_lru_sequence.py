@@ -101,7 +101,7 @@ def test_a_value_that_is_kept_again_counts_once() -> None:
 
 PEAKS = """
 import numpy as np
-from msgs_slam.pipelines.engine.stages import forget_peak, peak_memory_mb
+from msgs_slam.pipelines.engine.runner import forget_peak, peak_memory_mb
 peaks = [peak_memory_mb()]
 block = np.ones(40_000_000)
 peaks.append(peak_memory_mb())

@@ -5,15 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..config import Config, config_to_dict
-from ..run.records import StageRecord, differing_settings, recorded_config
+from ..run.folder import RunFolder
+from ..run.manifest import StageRecord, differing_settings, recorded_config
 from ..system.identity import stage_identity
-
-if TYPE_CHECKING:
-    from ..run.folder import RunFolder
-    from .stages import Stage
+from .stages import Stage
 
 
 def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) -> str:
@@ -31,7 +29,7 @@ def next_upstream(upstream: str, record: StageRecord) -> str:
     return hashlib.sha256((upstream + record.content).encode()).hexdigest()
 
 
-def kept_inputs(stage: Stage, config: Config, record: StageRecord | None, inputs: Any) -> Any:
+def effective_inputs(stage: Stage, config: Config, record: StageRecord | None, inputs: Any) -> Any:
     """The inputs of now with what `auto` has chosen as it was when the stage was made: that belongs to the run, and a
     network that has appeared since makes nothing out of date."""
     was = record.inputs if record is not None else None
@@ -42,14 +40,14 @@ def kept_inputs(stage: Stage, config: Config, record: StageRecord | None, inputs
     return kept | {k: v for k, v in (was or {}).items() if k in chosen} or None
 
 
-def newly_chosen(stage: Stage, config: Config, record: StageRecord, inputs: Any) -> list[str]:
+def changed_auto_choices(stage: Stage, config: Config, record: StageRecord, inputs: Any) -> list[str]:
     """Names of the inputs that `auto` would choose otherwise by now."""
-    if kept_inputs(stage, config, record, inputs) == inputs:
+    if effective_inputs(stage, config, record, inputs) == inputs:
         return []
     return [name for name in stage.auto(config) if (record.inputs or {}).get(name) != (inputs or {}).get(name)]
 
 
-def why_again(
+def rerun_reason(
     stage: Stage, run: RunFolder, record: StageRecord, config: Config, upstream: str, inputs: Any
 ) -> str:  # fmt: skip
     """Why a finished stage has to be made again, "" where it has not; `inputs` are those of now."""
@@ -57,7 +55,7 @@ def why_again(
         return "its folder is gone"
     if damaged := run.damaged(stage.name):
         return f"{len(damaged)} of its files are missing or damaged"
-    kept = kept_inputs(stage, config, record, inputs)
+    kept = effective_inputs(stage, config, record, inputs)
     if record.fingerprint != stage_fingerprint(stage, config, upstream, kept):
         return _what_differs(stage, record, config, upstream)
     return divided_otherwise(stage, run, record, config)

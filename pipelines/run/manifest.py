@@ -6,22 +6,18 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ...formats.digest import file_sha256
 from ...formats.errors import InputError
 from ...formats.reading import parsing
 from ...formats.textfile import read_json_object, write_json
 from ..config import Config, config_to_dict
 from ..read_config import merge_known_settings
 from ..system.wording import quoted
-from .layouts import dataclass_from_json
-from .names import EXTENSION, SOURCE_LIST, STAGES
-
-if TYPE_CHECKING:
-    from .folder import RunFolder
+from .names import STAGES
+from .schema import dataclass_from_json
 
 FORMAT = 2
 """Of manifest.json."""
@@ -94,28 +90,11 @@ def _check(value: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
-def load_records(run: RunFolder) -> dict[str, StageRecord]:
-    """The finished stages by name."""
-    manifest = run.manifest()
-    return {} if manifest is None else dict(manifest.records)
-
-
-def load_source(run: RunFolder) -> Source:
-    """Load the source of a run. Raises InputError for a folder that is not a run."""
-    source = read_manifest(run.manifest_file).source
-    path = Path(source.path)
-    if path.name != SOURCE_LIST:
-        return source
-    # The list of several videos is in the run, wherever that has been moved to.
-    folder = run.root / path.parent.name if path.parent.name.startswith(EXTENSION) else run.root
-    return replace(source, path=str(folder / SOURCE_LIST)) if (folder / SOURCE_LIST).is_file() else source
-
-
 def recorded_config(records: Mapping[str, StageRecord], config: Config) -> Config:
     """The settings that each finished stage was made with; of the stages that are not, those of `config`."""
     for name in STAGES:
         if name in records:
-            config, _ = merge_known_settings(config, records[name].settings)
+            config, _ = merge_known_settings(config, records[name].settings, "manifest.json")
     return config
 
 
@@ -133,12 +112,6 @@ def differing_settings(record: StageRecord, config: Config) -> list[str]:
         for key, value in config_to_dict(getattr(config, section)).items()
         if values.get(key, value) != value
     ]
-
-
-def checksums(folder: Path, but: tuple[str, ...] = ()) -> dict[str, tuple[int, str]]:
-    """Relative path, with slashes, → (bytes, sha256) of every file below, but for the entries `but` of the folder."""
-    files = {p.relative_to(folder): p for p in sorted(folder.rglob("*")) if p.is_file() and not p.is_symlink()}
-    return {n.as_posix(): (p.stat().st_size, file_sha256(p)) for n, p in files.items() if n.parts[0] not in but}
 
 
 def content_digest(files: Mapping[str, tuple[int, str]]) -> str:
