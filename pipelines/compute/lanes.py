@@ -254,6 +254,43 @@ def any_of(typing_context: Any, condition: Any) -> Any:
     return types.boolean(mask), emit
 
 
+@intrinsic
+def add_to_box(
+    typing_context: Any,
+    image: Any,
+    image_at: Any,
+    features: Any,
+    features_at: Any,
+    weights: Any,
+    weights_at: Any,
+    rows: Any,
+    columns: Any,
+    vectors: Any,
+) -> Any:
+    """image[pixel, :] += weights[pixel] * features for the pixels of a box that starts at the given places.
+
+    The box lies in a tile of 16 pixels a row, which keeps 16 numbers a pixel for each element of the tuple `vectors`.
+    The tuple's *type* carries the number, so that kernels are compiled for it and cached like any other.
+    """
+
+    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        count = sig.args[8].count
+        image, features, weights = (address_of(context, builder, sig.args[i], args[i], args[i + 1]) for i in (0, 2, 4))
+        feature = [load_lanes(builder, builder.gep(features, [I64(WIDTH * k)])) for k in range(count)]
+        with cgutils.for_range(builder, args[6]) as row, cgutils.for_range(builder, args[7]) as column:
+            pixel = builder.add(builder.mul(row.index, I64(WIDTH)), column.index)
+            weight = splat_lanes(builder, builder.load(builder.gep(weights, [pixel])))
+            for k in range(count):
+                offset = builder.add(builder.mul(pixel, I64(WIDTH * count)), I64(WIDTH * k))
+                target = builder.gep(image, [offset])
+                product = builder.fmul(weight, feature[k], flags=FLAGS)
+                store_lanes(builder, builder.fadd(load_lanes(builder, target), product, flags=FLAGS), target)
+        return context.get_dummy_value()
+
+    where_and_what = (image, types.intp, features, types.intp, weights, types.intp, types.intp, types.intp, vectors)
+    return types.void(*where_and_what), emit
+
+
 _EXP2 = (1.0, 0.693147206, 0.240226466, 0.0555032900, 0.00961851953, 0.00133998604, 0.000153375768)
 """2^f on [-1/2, 1/2], relative error 2e-9: least squares of the relative error at Chebyshev's nodes."""
 

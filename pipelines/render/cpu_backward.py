@@ -7,41 +7,56 @@ d loss / d alpha = light * q - S / (1 - alpha).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compute.jit import inner, kernel
-from ..compute.lanes import add_totals, at_most, counting, exp, load, reciprocal, splat, store, where
+from ..compute.jit import inlined, inner, kernel
+from ..compute.lanes import add_totals, load, reciprocal, splat, store, where
+from ..compute.threads import PART, for_each
 from . import reference
-from .cpu_bands import BAND_ROWS, RECORD, TILE, first_pixel, last_pixel
-from .cpu_forward import CHECK_EVERY, PIXELS, clear, is_opaque
+from .cpu_bands import PIXELS, RECORD, TILE, Bands, clear, for_each_band, row_opacity, walk_tiles
+from .cpu_forward import Vectors, vectors_for
 
 F32 = np.float32
-LIGHT, BEHIND, D_DEPTH, D_SEEN = (PIXELS * i for i in range(4))
-"""Planes of a tile's state: light as in the forward pass; what is still behind; the gradients of depth sum and
-silhouette."""
+BEHIND, D_DEPTH, D_SEEN, WEIGHTS = (PIXELS * i for i in range(4))
+"""Planes of a tile's state: what is still behind; the gradients of depth sum and silhouette; weights of a Gaussian."""
 PLANES = 4
 COLORS = 3
-"""Features that have gradients: nobody asks for those of class logits."""
+GEOMETRY = 5
+"""u, v, sigma_px, z, opacity."""
 
-_ALPHA_MAX, _LIGHT_MIN = F32(reference.ALPHA_MAX), F32(reference.TRANSMITTANCE_MIN)
+_ALPHA_MAX = F32(reference.ALPHA_MAX)
 _HALF, _ZERO, _ONE = F32(0.5), F32(0), F32(1)
 
 
-@inner
-def open_tile(
-    state: NDArray[np.float32],
-    image: NDArray[np.float32],
-    left: int,
-    top: int,
-    columns: int,
-    rows: int,
-    features: NDArray[np.float32],
-    planes: NDArray[np.float32],
-    d_features: NDArray[np.float32],
+def pull_back(
+    bands: Bands, features: NDArray[np.float32], planes: NDArray[np.float32], d_features: NDArray[np.float32],
     d_planes: NDArray[np.float32],
-) -> None:
-    """Loads the gradients of the pixels of a tile and everything that will be blended into them."""
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+    """Return the gradients of the Gaussians' u, v, sigma_px, z, opacity (5, M) and of their features (M, C).
+
+    Args:
+        bands: as the forward pass had them.
+        features, planes: its images (H, W, C) and (3, H, W).
+        d_features, d_planes: their gradients.
+    """
+    count, used = len(bands.first), features.shape[2]
+    d_geometry, d_values = np.zeros((GEOMETRY, count), F32), np.zeros((count, used), F32)
+    shared = np.empty((int(bands.slots[-1]), GEOMETRY + used), F32)
+    given = (features, planes, d_features, d_planes, d_geometry, d_values, shared)
+    vectors, places = vectors_for(used), (bands.first, bands.slots)
+    for_each_band(lambda b: backward_band(vectors, b, bands.own(b), *places, *bands.prepared[b], *given), bands.starts)
+    for_each(lambda n: sum_shared(n * PART, PART, bands.slots, shared, d_geometry, d_values), -(-count // PART))
+    return d_geometry, d_values
+
+
+@inner
+def open_gradients(job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.float32], tile: tuple[int, ...]) -> None:
+    """Load the gradients of the pixels of a tile and everything that will be blended into them."""
+    state, image, _, _, features, planes, d_features, d_planes = job
+    left, top, columns, rows = tile
     clear(state)
     for y in range(rows):
         for x in range(columns):
@@ -49,10 +64,9 @@ def open_tile(
             d_depth, d_depth_seen, d_seen = d_planes[0, row, column], d_planes[1, row, column], d_planes[2, row, column]
             behind = d_seen * planes[2, row, column]
             gradients, values = d_features[row, column], features[row, column]
-            for c in range(COLORS):
+            for c in range(COLORS if vectors is None else len(values)):
                 image[PIXELS * c + pixel] = gradients[c]
                 behind += gradients[c] * values[c]
-            state[LIGHT + pixel] = _ONE
             state[D_DEPTH + pixel] = d_depth
             depth_behind = d_depth * planes[0, row, column] + d_depth_seen * planes[1, row, column]
             state[BEHIND + pixel] = behind + depth_behind
@@ -60,49 +74,87 @@ def open_tile(
 
 
 @inner
-def pull_rows(
-    state: NDArray[np.float32],
-    image: NDArray[np.float32],
-    features: NDArray[np.float32],
-    at: int,
-    falloff_y: NDArray[np.float32],
-    falloff_x: object,
-    dx2: object,
-    z: np.float32,
-    y_center: np.float32,
-    reach2: np.float32,
-    first: int,
-    last: int,
-) -> tuple[object, object, object, object, object, object, object]:
-    """Sums over rows first..last, column by column, of m, m dy, m dy² and d loss / d z, with m = alpha * d loss /
-    d alpha, and of the gradients of the Gaussian's features, those from `at` on; light and what is behind go on behind
-    the Gaussian. The gradients of the image lie in the planes of `image`."""
-    red, green, blue = features[at], features[at + 1], features[at + 2]
-    pull, pull_y, pull_y2, d_z = splat(_ZERO), splat(_ZERO), splat(_ZERO), splat(_ZERO)
-    d_red, d_green, d_blue = splat(_ZERO), splat(_ZERO), splat(_ZERO)
-    for y in range(first, last + 1):
-        row = TILE * y
-        dy = F32(y) + _HALF - y_center
-        light = load(state, LIGHT + row)
-        alpha = at_most(falloff_x * falloff_y[y], _ALPHA_MAX)
-        alpha = where((dx2 <= splat(reach2 - dy * dy)) & (light >= _LIGHT_MIN), alpha)
-        weight = alpha * light
-        d_depth, by_red = load(state, D_DEPTH + row), load(image, row)
-        by_green, by_blue = load(image, PIXELS + row), load(image, 2 * PIXELS + row)
-        q = by_red * red + by_green * green + by_blue * blue + d_depth * z + load(state, D_SEEN + row)
-        behind = load(state, BEHIND + row) - weight * q
-        store(state, BEHIND + row, behind)
-        store(state, LIGHT + row, light - weight)
-        d_alpha = light * q - behind * reciprocal(_ONE - alpha)
-        m = where(alpha < splat(_ALPHA_MAX), d_alpha * alpha)
-        pull, pull_y, pull_y2 = pull + m, pull_y + m * dy, pull_y2 + m * (dy * dy)
-        d_z = d_z + weight * d_depth
-        d_red, d_green, d_blue = d_red + weight * by_red, d_green + weight * by_green, d_blue + weight * by_blue
-    return pull, pull_y, pull_y2, d_z, d_red, d_green, d_blue
+def pull_alpha(
+    state: NDArray[np.float32], light: NDArray[np.float32], row: int, before: Any, alpha: Any, weight: Any,
+    q: Any,
+) -> Any:  # fmt: skip
+    """alpha * d loss / d alpha in a row of pixels; light and what is behind go on behind the Gaussian."""
+    behind = load(state, BEHIND + row) - weight * q
+    store(state, BEHIND + row, behind)
+    store(light, row, before - weight)
+    d_alpha = before * q - behind * reciprocal(_ONE - alpha)
+    return where(alpha < splat(_ALPHA_MAX), d_alpha * alpha)
+
+
+@inlined
+def pull(
+    job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.float32], falloff_y: NDArray[np.float32], i: int,
+    box: tuple[int, ...], pair: tuple[Any, ...],
+) -> None:  # fmt: skip
+    """Add the gradients of one Gaussian in a tile to its row of d_records, all but those of z and features unscaled.
+
+    They are those of m = alpha * d loss / d alpha times 1, dx, dy, distance², column by column. The gradients of the
+    image lie in the planes of `image`; of three features they stay in registers, of others they are walked over twice.
+    """
+    state, image, d_records, padded = job[0], job[1], job[2], job[3]
+    _, dx, dx2, center, _, z = pair
+    first, last = box[2], box[3]
+    used = len(image) // PIXELS
+    pulled, pulled_y, pulled_y2, d_z = splat(_ZERO), splat(_ZERO), splat(_ZERO), splat(_ZERO)
+    if vectors is None:
+        at = COLORS * i
+        red, green, blue = padded[at], padded[at + 1], padded[at + 2]
+        d_red, d_green, d_blue = splat(_ZERO), splat(_ZERO), splat(_ZERO)
+        for y in range(first, last + 1):
+            row = TILE * y
+            dy = F32(y) + _HALF - center
+            before = load(light, row)
+            alpha = row_opacity(y, before, falloff_y, pair)
+            weight = alpha * before
+            d_depth, by_red = load(state, D_DEPTH + row), load(image, row)
+            by_green, by_blue = load(image, PIXELS + row), load(image, 2 * PIXELS + row)
+            q = by_red * red + by_green * green + by_blue * blue + d_depth * z + load(state, D_SEEN + row)
+            m = pull_alpha(state, light, row, before, alpha, weight, q)
+            pulled, pulled_y, pulled_y2 = pulled + m, pulled_y + m * dy, pulled_y2 + m * (dy * dy)
+            d_z = d_z + weight * d_depth
+            d_red, d_green, d_blue = d_red + weight * by_red, d_green + weight * by_green, d_blue + weight * by_blue
+        add_totals(d_records, 8 * i + 4, pulled, d_red, d_green, d_blue)
+        add_totals(d_records, 8 * i, pulled * dx, pulled_y, pulled * dx2 + pulled_y2, d_z)
+    else:
+        at, size = 16 * len(vectors) * i, 8 + used
+        for y in range(first, last + 1):
+            row = TILE * y
+            dy = F32(y) + _HALF - center
+            before = load(light, row)
+            alpha = row_opacity(y, before, falloff_y, pair)
+            weight = alpha * before
+            d_depth = load(state, D_DEPTH + row)
+            q = d_depth * z + load(state, D_SEEN + row)
+            for c in range(used):
+                q = q + load(image, PIXELS * c + row) * padded[at + c]
+            m = pull_alpha(state, light, row, before, alpha, weight, q)
+            pulled, pulled_y, pulled_y2 = pulled + m, pulled_y + m * dy, pulled_y2 + m * (dy * dy)
+            d_z = d_z + weight * d_depth
+            store(state, WEIGHTS + row, weight)
+        add_totals(d_records, size * i + 4, pulled, splat(_ZERO), splat(_ZERO), splat(_ZERO))
+        add_totals(d_records, size * i, pulled * dx, pulled_y, pulled * dx2 + pulled_y2, d_z)
+        for c in range(0, used, 4):
+            a, b, d, e = splat(_ZERO), splat(_ZERO), splat(_ZERO), splat(_ZERO)
+            for row in range(TILE * first, TILE * last + TILE, TILE):
+                weight, plane = load(state, WEIGHTS + row), PIXELS * c + row
+                a, b = a + weight * load(image, plane), b + weight * load(image, plane + PIXELS)
+                d, e = d + weight * load(image, plane + 2 * PIXELS), e + weight * load(image, plane + 3 * PIXELS)
+            add_totals(d_records, size * i + 8 + c, a, b, d, e)
+
+
+@inner
+def close_gradients(job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.float32], tile: tuple[int, ...]) -> None:
+    """Nothing is left to do in a tile: all is with the Gaussians."""
 
 
 @kernel
 def backward_band(
+    vectors: Vectors,
     band: int,
     own: NDArray[np.int32],
     first: NDArray[np.int32],
@@ -120,44 +172,20 @@ def backward_band(
     shared: NDArray[np.float32],
 ) -> None:
     """Gradients of the Gaussians seen in a band: of u, v, sigma_px, z, opacity to d_geometry (5, M) and of the features
-    to d_features (M, 3), or, where other bands add to them too, to their row of `shared` (S, 8).
+    to d_features (M, C), or, where other bands add to them too, to their row of `shared` (S, 5 + C).
 
     features and planes are the images of the forward pass, d_image and d_planes their gradients.
     """
-    height, width = features.shape[:2]
-    d_records = np.zeros(8 * len(own), np.float32)
-    band_top = band * BAND_ROWS
-    across = (width + TILE - 1) // TILE
-    image = np.zeros(PIXELS * COLORS, np.float32)
-    state = np.empty(PIXELS * PLANES, np.float32)
-    falloff_y = np.empty(TILE, np.float32)
-    for tile in range(len(tile_starts) - 1):
-        left, top = TILE * (tile % across), band_top + TILE * (tile // across)
-        columns, rows = min(TILE, width - left), min(TILE, height - top)
-        open_tile(state, image, left, top, columns, rows, features, planes, d_image, d_planes)
-        for k in range(tile_starts[tile], tile_starts[tile + 1]):
-            i = members[k]
-            at = RECORD * i
-            u_tile, v_tile, r = records[at] - F32(left), records[at + 1] - F32(top), records[at + 5]
-            x0, x1 = first_pixel(u_tile - r), last_pixel(u_tile + r, columns)
-            y0, y1 = first_pixel(v_tile - r), last_pixel(v_tile + r, rows)
-            if x1 < x0 or y1 < y0:
-                continue
-            sharpness = -_HALF / (records[at + 2] * records[at + 2])
-            dx = counting(_HALF - u_tile)
-            dy = counting(_HALF - v_tile)
-            dx2 = dx * dx
-            falloff_x = exp(dx2 * sharpness)
-            store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
-            pull, pull_y, pull_y2, d_z, d_red, d_green, d_blue = pull_rows(
-                state, image, padded, i * COLORS, falloff_y, falloff_x, dx2, records[at + 3], v_tile, r * r, y0, y1
-            )
-            add_totals(d_records, 8 * i + 4, pull, d_red, d_green, d_blue)
-            add_totals(d_records, 8 * i, pull * dx, pull_y, pull * dx2 + pull_y2, d_z)
-            if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, LIGHT):
-                break
+    height, width, used = features.shape
+    lanes_used = (used + 3) // 4 * 4  # features are summed up by fours
+    size, features_at = (8, GEOMETRY) if vectors is None else (8 + lanes_used, 8)
+    d_records = np.zeros(size * len(own), np.float32)
+    image = np.zeros(PIXELS * (COLORS if vectors is None else lanes_used), np.float32)
+    job = (np.empty(PIXELS * PLANES, np.float32), image, d_records, padded, features, planes, d_image, d_planes)
+    visitors = (open_gradients, pull, close_gradients)
+    walk_tiles(visitors, job, vectors, band, tile_starts, members, records, width, height)
     for k in range(len(own)):
-        i, at = own[k], 8 * k
+        i, at = own[k], size * k
         sigma_px, opacity = records[RECORD * k + 2], records[RECORD * k + 4]
         precision = _ONE / (sigma_px * sigma_px)
         d_records[at] *= precision
@@ -166,13 +194,15 @@ def backward_band(
         d_records[at + 4] /= opacity
         if slots[i + 1] > slots[i]:
             row = shared[slots[i] + band - first[i]]
-            for j in range(5 + COLORS):
+            for j in range(GEOMETRY):
                 row[j] = d_records[at + j]
+            for c in range(used):
+                row[GEOMETRY + c] = d_records[at + features_at + c]
         else:
-            for j in range(5):
+            for j in range(GEOMETRY):
                 d_geometry[j, i] = d_records[at + j]
-            for c in range(COLORS):
-                d_features[i, c] = d_records[at + 5 + c]
+            for c in range(used):
+                d_features[i, c] = d_records[at + features_at + c]
 
 
 @kernel
@@ -193,7 +223,7 @@ def sum_shared(
         for k in range(slots[i] + 1, slots[i + 1]):
             for c in range(len(first)):
                 first[c] += shared[k, c]
-        for j in range(5):
+        for j in range(GEOMETRY):
             d_geometry[j, i] = first[j]
-        for c in range(COLORS):
-            d_features[i, c] = first[5 + c]
+        for c in range(d_features.shape[1]):
+            d_features[i, c] = first[GEOMETRY + c]

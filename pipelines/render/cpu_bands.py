@@ -1,6 +1,7 @@
-"""Which Gaussian goes where: bands of rows, the unit of work of a thread, and the tiles of a band.
+"""Which Gaussian goes where: bands of rows, the unit of work of a thread, their tiles, and the walk over these.
 
-Everything is sized by a first counting pass, so a Gaussian may cover any number of bands and tiles.
+Everything is sized by a first counting pass, so a Gaussian may cover any number of bands and tiles. A tile keeps the
+state of its pixels in planes of `PIXELS` numbers, row after row of `TILE`.
 """
 
 from __future__ import annotations
@@ -8,21 +9,28 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..compute.jit import inner, kernel
+from ..compute.lanes import any_of, at_most, counting, exp, largest, load, splat, store, where
 from ..compute.threads import PART, for_each
 from . import reference
 
 F32 = np.float32
 TILE = 16
+PIXELS = TILE * TILE
 BAND_ROWS = 32  # two rows of tiles: more would leave threads idle at the end, fewer would split more Gaussians
 RECORD = 6
 """Numbers kept per Gaussian of a band: u, v, sigma_px, z, opacity, reach."""
 
+CHECK_EVERY = 32
+"""Gaussians between two looks at whether the whole tile is opaque."""
+
 _ALPHA_MIN, _CUT2 = F32(reference.ALPHA_MIN), F32(reference.CUT_SIGMAS**2)
+_ALPHA_MAX, _MIN_TRANSMITTANCE = F32(reference.ALPHA_MAX), F32(reference.TRANSMITTANCE_MIN)
 _HALF, _ZERO, _ONE, _TWO = F32(0.5), F32(0), F32(1), F32(2)
 
 
@@ -229,3 +237,88 @@ def list_tiles(
                 members[ends[place]] = k
                 ends[place] += 1
     return ends[: tiles + 1], members
+
+
+@inner
+def clear(numbers: NDArray[np.float32]) -> None:
+    """Fill with zeros. A slice assignment does the same but takes long to compile."""
+    for i in range(len(numbers)):
+        numbers[i] = _ZERO
+
+
+@inner
+def is_opaque(light: NDArray[np.float32]) -> bool:
+    """Whether no pixel of the tile takes any more light."""
+    most = load(light, 0)
+    for y in range(1, TILE):
+        most = largest(most, load(light, TILE * y))
+    return not any_of(most >= _MIN_TRANSMITTANCE)
+
+
+@inner
+def row_opacity(y: int, light: Any, falloff_y: NDArray[np.float32], pair: tuple[Any, ...]) -> Any:
+    """Opacity of a Gaussian in the pixels of row y of a tile, 0 where it ends or no light arrives; see `walk_tiles`."""
+    falloff_x, _, dx2, center, reach2, _ = pair
+    dy = F32(y) + _HALF - center
+    alpha = at_most(falloff_x * falloff_y[y], _ALPHA_MAX)
+    return where((dx2 <= splat(reach2 - dy * dy)) & (light >= _MIN_TRANSMITTANCE), alpha)
+
+
+@inner
+def walk_tiles(
+    visitors: tuple[Any, ...],
+    job: tuple[Any, ...],
+    kind: Any,
+    band: int,
+    tile_starts: NDArray[np.int64],
+    members: NDArray[np.int32],
+    records: NDArray[np.float32],
+    width: int,
+    height: int,
+) -> None:
+    """Walk over the tiles of a band, and over each one's Gaussians near to far, until the tile is opaque.
+
+    An isotropic Gaussian is a product of a function of x and one of y: a tile needs two vectors of exponentials for it,
+    not one per row.
+
+    Args:
+        visitors: functions that become part of the loop: open(job, kind, light, tile) and close(job, kind, light, tile)
+            of a tile = (left, top, columns, rows) of the image, and visit(job, kind, light, falloff_y, i, box, pair) of
+            the Gaussian of record i. It reaches the box = (x0, x1, y0, y1) of the tile, both ends included; pair =
+            (falloff_x, dx, dx2, centre's y in the tile, reach², depth), the first three of 16 columns; the opacity is
+            falloff_x * falloff_y[y], see `row_opacity`. It takes the light (PIXELS,) that the Gaussian stops.
+        job: what the visitors work on.
+        kind: handed to them apart from the job: its type may decide which of their branches are compiled.
+        band: number of the band.
+        tile_starts, members, records: of the band, see `Bands`.
+        width, height: of the image.
+    """
+    open_tile, visit, close_tile = visitors
+    band_top, across = band * BAND_ROWS, (width + TILE - 1) // TILE
+    light, falloff_y = np.empty(PIXELS, np.float32), np.empty(TILE, np.float32)
+    for tile in range(len(tile_starts) - 1):
+        left, top = TILE * (tile % across), band_top + TILE * (tile // across)
+        columns, rows = min(TILE, width - left), min(TILE, height - top)
+        # No light for what is no part of the image, so that nothing is blended there.
+        clear(light)
+        for y in range(rows):
+            for x in range(columns):
+                light[TILE * y + x] = _ONE
+        open_tile(job, kind, light, (left, top, columns, rows))
+        for k in range(tile_starts[tile], tile_starts[tile + 1]):
+            i = members[k]
+            at = RECORD * i
+            u, v, reach = records[at] - F32(left), records[at + 1] - F32(top), records[at + 5]
+            x0, x1 = first_pixel(u - reach), last_pixel(u + reach, columns)
+            y0, y1 = first_pixel(v - reach), last_pixel(v + reach, rows)
+            if x1 < x0 or y1 < y0:
+                continue
+            sharpness = -_HALF / (records[at + 2] * records[at + 2])
+            dx, dy = counting(_HALF - u), counting(_HALF - v)
+            dx2 = dx * dx
+            store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
+            pair = (exp(dx2 * sharpness), dx, dx2, v, reach * reach, records[at + 3])
+            visit(job, kind, light, falloff_y, i, (x0, x1, y0, y1), pair)
+            if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(light):
+                break
+        close_tile(job, kind, light, (left, top, columns, rows))

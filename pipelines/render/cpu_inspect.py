@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..compute.jit import kernel
-from ..compute.lanes import counting, exp, largest, largest_of, load, splat, store, total, where
-from .cpu_bands import BAND_ROWS, RECORD, TILE, Bands, first_pixel, for_each_band, last_pixel, split_into_bands
-from .cpu_forward import CHECK_EVERY, LIGHT, PIXELS, PLANES, blend_rows, clear, draw_bands, is_opaque, open_tile
+from ..compute.jit import inlined, inner, kernel
+from ..compute.lanes import largest, largest_of, load, splat, store, total, where
+from .cpu_bands import PIXELS, TILE, Bands, clear, for_each_band, split_into_bands, walk_tiles
+from .cpu_forward import WEIGHTS, blend_rows, draw_bands
 
 F32 = np.float32
+MEDIAN, COUNT, PLANES = 2 * PIXELS, 3 * PIXELS, 4
+"""Planes of a tile's state behind those of `blend_rows`: median depths, and what a pixel counts."""
+ONLY, IS_MIXED = PIXELS, PIXELS + 1
+"""Behind the classes of a tile's pixels: the class that is seen, and 1 where there are more."""
 _HALF, _ZERO = F32(0.5), F32(0)
 
 
@@ -37,7 +42,7 @@ def weighted_errors(
     """(M,) blending weights of each Gaussian, summed over the pixels, each weighed with its error: `error_of` the
     (H, W, 3) colours that are shown, (H, W); float32 CPU tensors."""
     bands = bands_of((u, v, sigma_px, z, opacity), colors, width, height, near)
-    shown, _ = draw_bands(bands, None, 3, width, height)
+    shown, _ = draw_bands(bands, 3, width, height)
     errors = error_of(torch.from_numpy(shown))
     return _walk(bands, errors, torch.zeros(height, width, dtype=torch.uint8), 0)[1][:, 0]
 
@@ -75,6 +80,61 @@ def _walk(bands: Bands, counts: Tensor, channels: Tensor, classes: int) -> tuple
     return torch.from_numpy(median), torch.from_numpy(found)
 
 
+@inner
+def open_counts(job: tuple[Any, ...], kind: None, light: NDArray[np.float32], tile: tuple[int, ...]) -> None:
+    """Load what the pixels count and their classes; note whether the tile shows more than one of them, or which."""
+    state, classes, counted, channels = job[0], job[1], job[3], job[4]
+    left, top, columns, rows = tile
+    clear(state)
+    only, is_mixed = -1, 0
+    for y in range(rows):
+        for x in range(columns):
+            pixel, count, own_channel = TILE * y + x, counted[top + y, left + x], int(channels[top + y, left + x])
+            state[COUNT + pixel], classes[pixel] = count, own_channel
+            if count > _ZERO:
+                if only >= 0 and only != own_channel:
+                    is_mixed = 1
+                only = own_channel
+    classes[ONLY], classes[IS_MIXED] = only, is_mixed
+
+
+@inlined
+def weigh(
+    job: tuple[Any, ...], kind: None, light: NDArray[np.float32], falloff_y: NDArray[np.float32], i: int,
+    box: tuple[int, ...], pair: tuple[Any, ...],
+) -> None:  # fmt: skip
+    """Add one Gaussian's weights in a tile, and note where half of the light is lost in it."""
+    state, classes, seen = job[0], job[1], job[2]
+    x0, x1, y0, y1 = box
+    blend_rows(light, state, falloff_y, y0, y1, pair)
+    summed, top_weight = splat(_ZERO), splat(_ZERO)
+    for row in range(TILE * y0, TILE * y1 + TILE, TILE):
+        weight, behind = load(state, WEIGHTS + row), load(light, row)
+        summed, top_weight = summed + weight * load(state, COUNT + row), largest(top_weight, weight)
+        before = load(state, MEDIAN + row)
+        here = (behind < splat(_HALF)) & (weight > splat(_ZERO)) & (before <= splat(_ZERO))
+        store(state, MEDIAN + row, before + where(here, splat(pair[5])))
+    sum_here = total(summed)
+    seen[i, 0] += sum_here
+    seen[i, 1] = max(seen[i, 1], largest_of(top_weight))
+    if seen.shape[1] > 2 and classes[IS_MIXED] == 0:  # most tiles show one class
+        seen[i, 2 + max(classes[ONLY], 0)] += sum_here
+    elif seen.shape[1] > 2:
+        for y in range(y0, y1 + 1):
+            for pixel in range(TILE * y + x0, TILE * y + x1 + 1):
+                seen[i, 2 + classes[pixel]] += state[WEIGHTS + pixel] * state[COUNT + pixel]
+
+
+@inner
+def close_counts(job: tuple[Any, ...], kind: None, light: NDArray[np.float32], tile: tuple[int, ...]) -> None:
+    """Write the tile's median depths."""
+    state, median = job[0], job[5]
+    left, top, columns, rows = tile
+    for y in range(rows):
+        for x in range(columns):
+            median[top + y, left + x] = state[MEDIAN + TILE * y + x]
+
+
 @kernel
 def inspect_band(
     band: int,
@@ -91,67 +151,15 @@ def inspect_band(
     found: NDArray[np.float32],
     shared: NDArray[np.float32],
 ) -> None:
-    """Fills the band's rows of `median`, and those of `found` (or of `shared`) of the Gaussians seen in it."""
+    """Fill the band's rows of `median`, and those of `found` (or of `shared`) of the Gaussians seen in it."""
     height, width = median.shape
-    columns_found = found.shape[1]
-    seen = np.zeros((len(own), columns_found), np.float32)
-    band_top = band * BAND_ROWS
-    across = (width + TILE - 1) // TILE
-    state, weights = np.empty(PIXELS * PLANES, np.float32), np.zeros(PIXELS, np.float32)
-    falloff_y, medians = np.empty(TILE, np.float32), np.empty(PIXELS, np.float32)
-    count, channel = np.empty(PIXELS, np.float32), np.zeros(PIXELS, np.int64)
-    for tile in range(len(tile_starts) - 1):
-        left, top = TILE * (tile % across), band_top + TILE * (tile // across)
-        columns, rows = min(TILE, width - left), min(TILE, height - top)
-        open_tile(state, columns, rows)
-        clear(medians)
-        clear(count)
-        only, is_mixed = -1, False
-        for y in range(rows):
-            for x in range(columns):
-                count[TILE * y + x] = counted[top + y, left + x]
-                own_channel = int(channels[top + y, left + x])
-                channel[TILE * y + x] = own_channel
-                if count[TILE * y + x] > _ZERO:
-                    is_mixed = is_mixed or (only >= 0 and only != own_channel)
-                    only = own_channel
-        for k in range(tile_starts[tile], tile_starts[tile + 1]):
-            i = members[k]
-            at = RECORD * i
-            u_tile, v_tile, r = records[at] - F32(left), records[at + 1] - F32(top), records[at + 5]
-            y0, y1 = first_pixel(v_tile - r), last_pixel(v_tile + r, rows)
-            if y1 < y0:
-                continue
-            sharpness = -_HALF / (records[at + 2] * records[at + 2])
-            dx, dy = counting(_HALF - u_tile), counting(_HALF - v_tile)
-            dx2 = dx * dx
-            store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
-            depth = records[at + 3]
-            blend_rows(state, weights, falloff_y, exp(dx2 * sharpness), dx2, v_tile, r * r, depth, y0, y1)
-            summed, top_weight = splat(_ZERO), splat(_ZERO)
-            for y in range(y0, y1 + 1):
-                weight, light = load(weights, TILE * y), load(state, LIGHT + TILE * y)
-                summed, top_weight = summed + weight * load(count, TILE * y), largest(top_weight, weight)
-                before = load(medians, TILE * y)
-                here = (light < splat(_HALF)) & (weight > splat(_ZERO)) & (before <= splat(_ZERO))
-                store(medians, TILE * y, before + where(here, splat(depth)))
-            sum_here = total(summed)
-            seen[i, 0] += sum_here
-            seen[i, 1] = max(seen[i, 1], largest_of(top_weight))
-            if columns_found > 2 and not is_mixed:  # most tiles show one class
-                seen[i, 2 + max(only, 0)] += sum_here
-            elif columns_found > 2:
-                x0, x1 = first_pixel(u_tile - r), last_pixel(u_tile + r, columns)
-                for y in range(y0, y1 + 1):
-                    for pixel in range(TILE * y + x0, TILE * y + x1 + 1):
-                        seen[i, 2 + channel[pixel]] += weights[pixel] * count[pixel]
-            if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(state, LIGHT):
-                break
-        for y in range(rows):
-            for x in range(columns):
-                median[top + y, left + x] = medians[TILE * y + x]
+    seen = np.zeros((len(own), found.shape[1]), np.float32)
+    state, classes = np.empty(PLANES * PIXELS, F32), np.zeros(PIXELS + 2, np.int64)
+    job = (state, classes, seen, counted, channels, median)
+    visitors = (open_counts, weigh, close_counts)
+    walk_tiles(visitors, job, None, band, tile_starts, members, records, width, height)
     for k in range(len(own)):
         i = own[k]
         row = shared[slots[i] + band - first[i]] if slots[i + 1] > slots[i] else found[i]
-        for c in range(columns_found):
+        for c in range(found.shape[1]):
             row[c] = seen[k, c]

@@ -24,16 +24,14 @@ def run(
     backend: str,
     dtype: torch.dtype,
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Images, and gradients of a fixed random weighting of all of them where the features are three."""
+    """Images, and gradients of a fixed random weighting of all of them."""
     inputs = {name: tensor.detach().clone().to(dtype).requires_grad_() for name, tensor in scene.items()}
     image = composite(**inputs, width=width, height=height, backend=backend)
     images = {name: getattr(image, name) for name in IMAGES}
     generator = torch.Generator().manual_seed(5)
     upstream = [torch.randn(x.shape, generator=generator).to(dtype) for x in images.values()]
-    gradients = {}
-    if scene["features"].shape[1] == 3:  # of colours; class logits have none
-        torch.autograd.backward(list(images.values()), upstream)
-        gradients = {name: inputs[name].grad for name in NAMES}
+    torch.autograd.backward(list(images.values()), upstream)
+    gradients = {name: inputs[name].grad for name in NAMES}
     return {name: x.detach() for name, x in images.items()}, gradients
 
 
@@ -131,14 +129,16 @@ def test_the_projection_is_that_of_torch():
         assert torch.equal(b, c)
 
 
-def test_map_and_pose_gradients_through_the_projection():
+@pytest.mark.parametrize("classes", [0, 8])
+def test_map_and_pose_gradients_through_the_projection(classes):
     """The judge is given the centres as float32 rounds them: 1e-5 pixel is enough to move a pixel over the edge of a
     Gaussian, and how float32 rounds is the machine's own affair. Its gradients go through its own projection."""
-    scene = room(160, 120, 12_000, 1)
+    scene = room(160, 120, 12_000, 8)
+    features = torch.cat([scene.colors, scene.logits[:, :classes]], 1)
     rounded: list[Tensor] = []
     results = []
     for backend, dtype in (("cpu", torch.float32), ("reference", torch.float64)):
-        tensors = (scene.means, scene.radii, scene.opacities, scene.colors)
+        tensors = (scene.means, scene.radii, scene.opacities, features)
         tensors = [x.clone().to(dtype).requires_grad_() for x in tensors]
         twist = torch.zeros(6, dtype=dtype, requires_grad=True)
         projected = project_map(*tensors[:2], moved(MOVED, twist), scene.intrinsics)
@@ -152,7 +152,7 @@ def test_map_and_pose_gradients_through_the_projection():
         results.append([*(x.detach() for x in outputs), *(x.grad for x in (*tensors, twist))])
     for name, ours, exact in zip(("image", "depth sum", "silhouette"), *results, strict=False):
         assert (ours - exact).abs().max() < 1e-4 * max(1.0, float(exact.max())), name
-    names = ("means", "radii", "opacities", "colors", "twist")
+    names = ("means", "radii", "opacities", "features", "twist")
     for name, ours, exact in zip(names, results[0][3:], results[1][3:], strict=True):
         assert (ours - exact).norm() < 1e-3 * exact.norm(), name
 
