@@ -65,7 +65,8 @@ def render_run(
     before the first image is drawn. Returns `target`; where browsers will not play the video, a warning says so. Raises
     InputError for an unknown kind or path, a bad file, or a run without a map.
     """
-    _require_choice("kind", kind, KINDS)
+    if kind not in KINDS:
+        raise InputError(f"kind is one of {', '.join(KINDS)}; got {kind!r}")
     rate = 30.0 if fps is None else fps
     _require_target(target, rate)
     given = _given_path(path, fps)
@@ -204,11 +205,6 @@ def _of_size(outcome: Outcome, size: tuple[int, int]) -> Outcome:
     return replace(
         outcome, calibration=replace(outcome.calibration, intrinsics=Intrinsics(width, height, fx, fy, cx, cy))
     )
-
-
-def _require_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise InputError(f"{name} is one of {', '.join(choices)}; got {value!r}")
 
 
 def _write_pictures(folder: Path, pictures: Iterator[Picture]) -> Path:

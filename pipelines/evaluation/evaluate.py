@@ -68,11 +68,15 @@ def evaluate_outcome(
             f"{truth.root}: none of its {len(truth)} frames belongs to the {len(outcome.frames)} frames of "
             f"{outcome.run.root} by name or by time. Is it the truth of another recording?"
         )
-    matching = _matching(outcome, truth, class_map)
+    if class_map is not None:
+        class_map.require_known((*outcome.classes.names, *outcome.vocabulary), truth.class_names)
+    matching = match_classes(outcome.classes.names, outcome.vocabulary, truth.class_names, class_map)
     trajectory, alignment = trajectory_cells(outcome, matched)
-    measured = None
+    why = {"missing": f"mapping is not done; the last stage is {outcome.pose_stage}"}
+    of_map: dict[str, Any] = {"images": why, "depth": why, "labels": why, "views": []}
     if outcome.gaussian_map is not None:
         measured = measure_views(outcome, matched, alignment, matching, progress or SilentProgress(), max_views)
+        of_map = measured.cells(outcome, matched)
     result = {
         "run": outcome.run.root.name,
         "truth": f"{truth.root.name} ({truth.format})",
@@ -83,23 +87,12 @@ def evaluate_outcome(
         "trajectory": trajectory,
         "scale": scale_cells(outcome, trajectory),
         "frame errors": frame_errors(outcome, matched, alignment),
-        **(measured.cells(outcome, matched) if measured else _without_map(outcome)),
+        **of_map,
         "mesh": mesh_cells(outcome, matched, alignment),
         "cost": cost_cells(outcome),
     }
     # A round trip: what cannot be written as JSON (NaN, arrays) shows here and not at the user's.
     return json.loads(json.dumps(result, allow_nan=False))
-
-
-def _matching(outcome: Outcome, truth: Sequence, class_map: ClassMap | None) -> Matching | None:
-    if class_map is not None:
-        class_map.require_known((*outcome.classes.names, *outcome.vocabulary), truth.class_names)
-    return match_classes(outcome.classes.names, outcome.vocabulary, truth.class_names, class_map)
-
-
-def _without_map(outcome: Outcome) -> dict[str, Any]:
-    why = {"missing": f"mapping is not done; the last stage is {outcome.pose_stage}"}
-    return {"images": why, "depth": why, "labels": why, "views": []}
 
 
 def frame_cells(outcome: Outcome, matched: MatchedTruth) -> dict[str, Any]:

@@ -64,7 +64,7 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
     Raises InputError for a run without poses.
     """
     outcome = load_outcome(run)
-    sparse, loops = outcome.load_sparse(), _load_loops(outcome)
+    sparse, loops = outcome.load_sparse(), run.load(LOOPS) if "global_ba" in outcome.records else []
     capture = read_capture(outcome, sparse)
     views = None if outcome.gaussian_map is None else render_views(outcome, progress or SilentProgress())
     evaluation = read_json(run.evaluation_file) if run.evaluation_file.exists() else None
@@ -86,10 +86,6 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
     target = path or run.report_file
     write_text(target, page(f"{run.root.name} – report", body))
     return target
-
-
-def _load_loops(outcome: Outcome) -> list[LoopEdge]:
-    return outcome.run.load(LOOPS) if "global_ba" in outcome.records else []
 
 
 def _figures(outcome: Outcome, views: RenderedViews | None) -> list[tuple[str, str]]:
@@ -286,7 +282,9 @@ def render_views(outcome: Outcome, progress: Progress) -> RenderedViews:
             depth = depth_picture(view.depth, *reach)
             labels = labels_on_photo(photo, view.labels, outcome.classes.colors)
             pairs = ((photo, "image"), (picture, "map"), (depth, "depth"), (labels, "classes"))
-            tiles += [_tile(p, f"{what}, {frame.timestamp:.2f} s") for p, what in pairs]
+            for drawn, what in pairs:
+                caption = f"{what}, {frame.timestamp:.2f} s"
+                tiles.append(f"<div>{image(at_most_wide(drawn, _TILE_WIDTH), caption)}{escape(caption)}</div>")
     first, rest = "".join(tiles[: 4 * _ROWS]), "".join(tiles[4 * _ROWS :])
     more = f'<details><summary>More views</summary><div class="grid">{rest}</div></details>' if rest else ""
     scale = _depth_scale(*reach, unit_name(outcome))
@@ -308,10 +306,6 @@ def _reach(outcome: Outcome, ids: list[int]) -> tuple[float, float]:
     rows = [outcome.frame_row(frame_id) for frame_id in ids[:: max(1, len(ids) // 3)]]
     ranges = [depth_range(render_outcome(outcome, outcome.trajectory.cam_from_world[row]).depth) for row in rows]
     return (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else (1.0, 2.0)
-
-
-def _tile(picture: NDArray[np.uint8], caption: str) -> str:
-    return f"<div>{image(at_most_wide(picture, _TILE_WIDTH), caption)}{escape(caption)}</div>"
 
 
 def quality_section(outcome: Outcome, capture: Capture, views: RenderedViews | None) -> str:

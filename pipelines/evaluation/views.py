@@ -143,12 +143,9 @@ def sheet(rows: Sequence[Sequence[Picture]], titles: Sequence[str], width: int =
     lines = [_titles(titles, width)]
     for row in rows:
         resized = [np.asarray(cv2.resize(p, (width, height), interpolation=cv2.INTER_AREA), np.uint8) for p in row]
-        lines.append(np.concatenate([_bordered(p) for p in resized], axis=1))
+        bordered = [np.pad(p, ((0, 4), (0, 4), (0, 0)), constant_values=255) for p in resized]
+        lines.append(np.concatenate(bordered, axis=1))
     return np.concatenate(lines, axis=0)
-
-
-def _bordered(picture: Picture) -> Picture:
-    return np.pad(picture, ((0, 4), (0, 4), (0, 0)), constant_values=255)
 
 
 def _titles(titles: Sequence[str], width: int) -> Picture:

@@ -89,18 +89,13 @@ def seen_points(
 def write_ply(outcome: Outcome, sh_rest: bool, folder: Path) -> list[Path]:
     """The map as splat PLYs, in its own colours and in those of the classes; part by part, for a cloud takes more
     memory than the map it is of. The probabilities are in the first only."""
-    clouds, names = _in_parts(outcome), outcome.classes.names
+    starts, names = range(0, max(len(outcome.require_map()), 1), _PART), outcome.classes.names
+    clouds = LruSequence(len(starts), lambda n: map_cloud(outcome, slice(starts[n], starts[n] + _PART)), len, 0)
     paths = [folder / n for n in ("point_cloud.ply", "point_cloud_semantic.ply")]
     write_gaussian_ply(paths[0], clouds, names, sh_degree=3 * sh_rest)
     by_class = clouds.changed(lambda _, cloud: _by_class(cloud, outcome))
     write_gaussian_ply(paths[1], by_class, names, sh_degree=3 * sh_rest)
     return paths
-
-
-def _in_parts(outcome: Outcome) -> LruSequence[GaussianCloud]:
-    """The map as clouds of a `_PART` each, one at a time in memory."""
-    starts = range(0, max(len(outcome.require_map()), 1), _PART)
-    return LruSequence(len(starts), lambda n: map_cloud(outcome, slice(starts[n], starts[n] + _PART)), len, 0)
 
 
 def write_splats(kind: str, outcome: Outcome, world: World, settings: ExportConfig, folder: Path) -> list[Path]:
