@@ -70,10 +70,14 @@ class FusedDepth(DepthProvider):
 
 
 def fuse(learned: DepthEstimate, geometry: DepthEstimate, scale: float, frame_scale: float) -> DepthEstimate:
-    """One frame's learned depth and multi-view depth (times `scale` in the learned unit) as one.
+    """Fuse one frame's learned depth and multi-view depth, in the unit of the learned one.
 
-    `frame_scale` is what this frame's learned depth says of the scale: where no geometry is near, the learned depth
-    is corrected by scale / frame_scale.
+    Args:
+        learned: depth by the network.
+        geometry: depth by several views, in the unit of the backbone.
+        scale: of the run: turns the geometry's unit into the learned one.
+        frame_scale: the same by this frame's learned depth; where no geometry is near, that is corrected by
+            scale / frame_scale.
     """
     lead = (geometry.confidence >= SURE) & (geometry.depth > 0)
     both = lead & (learned.depth > 0)

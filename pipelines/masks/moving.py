@@ -76,9 +76,17 @@ def find_moving(
     progress: Progress,
     first: dict[int, NDArray[np.bool_]],
 ) -> dict[int, NDArray[np.bool_]]:
-    """Index of a keyframe → (h, w) what of it moved, for those with any. `camera` has the size of the views, poses
-    (N, 4, 4) cam_from_world. A second and third round let what was found before speak neither for nor against; `first`:
-    what `look_once` at all has found."""
+    """Find what moved: index of a keyframe → (h, w), for those with any.
+
+    A second and third round let what was found before speak neither for nor against.
+
+    Args:
+        poses: (N, 4, 4) cam_from_world of the keyframes.
+        load: loads the view of a keyframe by its index.
+        camera: intrinsics at the size of the views.
+        progress: shows the rounds.
+        first: what `look_once` at all keyframes has found.
+    """
     found = first
     for _ in range(_ROUNDS - 1 if found else 0):
         found = {**found, **look_once(sorted(found), poses, load, camera, progress, found, _AGAIN)}

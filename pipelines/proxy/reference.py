@@ -195,7 +195,15 @@ def reference_scale(
     scale: DepthScale,
     depth_of: Callable[[Frame], DepthEstimate],
 ) -> ReferenceScale | None:
-    """Metres per unit of the depth by what the user knows; None without that, and where the depth is metric anyway.
+    """Find the metres per unit of the depth by what the user knows; None without that, and where the depth is metric.
+
+    Args:
+        context: settings and source of the stage.
+        sequence: the frames with their cameras.
+        frames: those with depth.
+        depths: the provider of the depth.
+        scale: the depth's unit in that of the backbone.
+        depth_of: loads the depth of a frame.
 
     Raises InputError when the reference cannot be measured in this scene.
     """

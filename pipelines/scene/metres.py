@@ -44,8 +44,15 @@ def find_metres(
     """Estimate the unit of the world of `trajectory` in metres, None where they are unknown, or could only be guessed
     although guesses are off; and a warning where there is evidence against them.
 
-    guess: whether what is usual in the world counts; card: a network for metric depth, where there is one, on so many
-    threads of the device. Raises InputError for a network that is not what its card says.
+    Args:
+        run: the run, with its proxy maps.
+        trajectory: poses in the world whose unit is asked for.
+        guess: whether what is usual in the world counts.
+        card: a network for metric depth, where there is one.
+        threads: of the network.
+        device: "cpu" or "cuda".
+
+    Raises InputError for a network that is not what its card says.
     """
     given = known_evidence(run)
     seen = load_seen(run, trajectory) if guess else None

@@ -44,8 +44,15 @@ _INDEPENDENT = 6
 def network_scale(
     card: Card, frames: Sequence[SeenFrame], camera: Intrinsics, threads: int, device: str
 ) -> Evidence | None:
-    """Metres per unit that make the frames' depth what the network says, the median over frames; None where the network
-    and the frames' reliable depth have too little in common.
+    """Find the metres per unit that make the frames' depth what the network says, the median over frames; None where
+    the network and the frames' reliable depth have too little in common.
+
+    Args:
+        card: a network for metric depth.
+        frames: the keyframes it looks at.
+        camera: intrinsics of their images.
+        threads: of the network.
+        device: "cpu" or "cuda".
 
     Raises InputError for a network that is not what its card says.
     """

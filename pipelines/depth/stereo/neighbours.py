@@ -23,10 +23,17 @@ _MOST_CANDIDATES = 128
 def choose_neighbours(
     model: SparseModel, intrinsics: Intrinsics, index: int, count: int, best_angle: float
 ) -> NDArray[np.int64]:
-    """Up to `count` indices of keyframes to match keyframe `index` with, best first.
+    """Choose the keyframes to match one with: their indices, best first.
 
-    A view is good when it sees the same points under an angle near `best_angle` degrees (as in MVSNet, Yao et al.,
-    ECCV 2018), and when it does not repeat a view already chosen. `intrinsics` are those of the observations.
+    A view is good when it sees the same points under an angle near the best (as in MVSNet, Yao et al., ECCV 2018), and
+    when it does not repeat a view already chosen.
+
+    Args:
+        model: the sparse model of structure from motion.
+        intrinsics: of the camera that the observations are of.
+        index: of the keyframe.
+        count: most views to choose.
+        best_angle: degrees between the rays to a point.
     """
     points, ids = _points_of(model, index)
     if len(points) == 0 or len(model.frame_ids) < 2:

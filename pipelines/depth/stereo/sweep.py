@@ -57,10 +57,16 @@ def sweep_cost(
     bands: Bands,
     tried: NDArray[np.bool_] | None = None,
 ) -> Volume:
-    """Cost 1 - score in [0, 2] of the inverse depths (D,); `others` (N, H, W) lie as the warps say.
+    """Compute the cost, 1 - score, in [0, 2]. Where no view sees the point it is 1, as for a surface without texture.
 
-    Intensities are 0..1. Where no view sees the point the cost is 1, as for a surface without texture. Of each tile
-    only the planes `tried` (tiles down, tiles across, D) are there; None: all.
+    Args:
+        image: (H, W) intensities 0..1.
+        others: (N, H, W) of the other views.
+        warps: (N, 3, 4) as of `warps_to`.
+        inverse_depths: (D,) of the planes.
+        best: how many of the views count at a pixel.
+        bands: runs bands of rows on threads.
+        tried: (tiles down, tiles across, D) the planes that are there; None: all.
     """
     height, width = image.shape
     if tried is None:
@@ -158,9 +164,13 @@ def refine_inverse_depth(
     best: int,
     bands: Bands,
 ) -> NDArray[np.float32]:
-    """(H, W) inverse depth moved by up to `reach` steps to where the views correlate best.
+    """Move inverse depth (H, W) to where the views correlate best; image, others, warps, best, bands as `sweep_cost`.
 
-    A move of n steps costs `stiffness` n² of correlation, so that a surface without texture stays where it is.
+    Args:
+        inverse_depth: (H, W) where the moves start.
+        step: of inverse depth.
+        reach: most steps either way.
+        stiffness: a move of n steps costs stiffness * n² of correlation, so that a surface without texture stays.
     """
     refined, paired = np.empty_like(inverse_depth), with_row_below(others)
 
