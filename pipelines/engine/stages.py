@@ -1,4 +1,4 @@
-"""What a stage of a run is, and everything that it is given."""
+"""Stages of a run: what each is, and everything that it is given."""
 
 from __future__ import annotations
 
