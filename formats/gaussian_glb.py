@@ -28,7 +28,7 @@ _PROPERTIES = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
 _LABEL = "_LABEL"
 # glTF's y is up and its z comes towards the viewer; splats have x right, y down, z forward.
 _FLIP = np.array([1, -1, -1], dtype=np.float32)
-_LEAST_OPACITY = 1e-4
+_MIN_OPACITY = 1e-4
 
 
 def write_gaussian_glb(path: Path, cloud: GaussianCloud, class_names: tuple[str, ...] = ()) -> None:
@@ -126,7 +126,7 @@ def _accessor(document: dict[str, Any], binary: bytes, index: int) -> NDArray[np
 
 
 def _cloud(arrays: dict[str, NDArray[np.float32]]) -> GaussianCloud:
-    opacity = arrays[f"{EXTENSION}:OPACITY"][:, 0].astype(np.float64).clip(_LEAST_OPACITY, 1 - _LEAST_OPACITY)
+    opacity = arrays[f"{EXTENSION}:OPACITY"][:, 0].astype(np.float64).clip(_MIN_OPACITY, 1 - _MIN_OPACITY)
     quat_xyzw = arrays[f"{EXTENSION}:ROTATION"] * np.append(_FLIP, np.float32(1))
     smallest = np.finfo(np.float32).tiny
     return GaussianCloud(

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .colmap import model_suffix, read_colmap_model
+from .colmap import MODEL_FOLDERS, model_suffix, read_colmap_model
 from .errors import InputError
 from .reading import home_expanded, reaching
 from .textfile import read_json, read_json_object, read_rows, read_text
@@ -32,7 +32,6 @@ _ODOMETRY = ("frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 Found = tuple[str, list[str], Array]
 """Of which app, the images' names without suffix, and world_from_cam (N, 4, 4)."""
 
-_MODEL_FOLDERS = (".", "sparse/0", "sparse", "0")
 _TABLES = ("transforms.json", "transforms_train.json")
 _MATRIX_KEYS = (
     "transform_matrix", "cameraPoseARFrame", "transform", "camera_transform", "camera_pose", "pose", "matrix",
@@ -53,7 +52,7 @@ class PoseFile:
     files of its kind always are in metres; `lost`: how many poses of the file are not finite, and here NaN or left
     out."""
 
-    what: str
+    kind: str
     world_from_cam: NDArray[np.float64]
     names: tuple[str, ...] = ()
     times: NDArray[np.float64] | None = None
@@ -72,8 +71,8 @@ def read_poses(path: Path) -> PoseFile:
             raise InputError(f"--poses {path}: there is no such file or folder: check the spelling")
         phone = phone_poses(path) if path.is_dir() or path.suffix.lower() in (".csv", ".json") else None
         if phone is not None:
-            what, names, poses = phone
-            found = PoseFile(what, poses, _unique(names, path), is_metric=True)
+            kind, names, poses = phone
+            found = PoseFile(kind, poses, _unique(names, path), is_metric=True)
         elif path.is_dir():
             found = _from_folder(path)
         else:
@@ -93,7 +92,7 @@ def stem(name: str) -> str:
 
 
 def _from_folder(path: Path) -> PoseFile:
-    for folder in (path / name for name in _MODEL_FOLDERS):
+    for folder in (path / name for name in MODEL_FOLDERS):
         if folder.is_dir() and model_suffix(folder):
             return _from_colmap(folder)
     table = next((path / name for name in _TABLES if (path / name).is_file()), None)

@@ -17,7 +17,7 @@ _LONGEST_NAME, _LONGEST_PATH = 255, 4000
 """Bytes that Linux takes for a part of a path, and a little less than it takes for the whole."""
 
 _LFS_POINTER = b"version https://git-lfs"
-_MOST_OF_A_REASON = 200
+_MAX_REASON_CHARACTERS = 200
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -58,15 +58,15 @@ def parsing(path: Path | str, what: str, advice: str = "copy or export it again"
         raise
     except Exception as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
-        reason = lines[-1][:_MOST_OF_A_REASON]
+        reason = lines[-1][:_MAX_REASON_CHARACTERS]
         raise InputError(f"{path} is damaged or no {what} ({reason}): {advice}") from error
 
 
 @contextmanager
-def opened(path: Path, most: int | None = None, *, any_content: bool = False) -> Iterator[BufferedReader]:
+def opened(path: Path, limit: int | None = None, *, any_content: bool = False) -> Iterator[BufferedReader]:
     """A regular file, open for reading.
 
-    Raises InputError when it is missing, may not be read, is larger than `most` bytes, or no file at all (a pipe or a
+    Raises InputError when it is missing, may not be read, is larger than `limit` bytes, or no file at all (a pipe or a
     device would be waited for or read without an end), and unless `any_content` when it is empty or a git-LFS pointer.
     """
     path = Path(path)
@@ -81,7 +81,7 @@ def opened(path: Path, most: int | None = None, *, any_content: bool = False) ->
             raise InputError(f"{path} is a folder, not a file") from None
     with file:
         with reaching(path):
-            _require_kind(path, file, most)
+            _require_kind(path, file, limit)
             if not any_content:
                 _require_content(path, file)
         try:
@@ -93,13 +93,13 @@ def opened(path: Path, most: int | None = None, *, any_content: bool = False) ->
             raise
 
 
-def _require_kind(path: Path, file: BufferedReader, most: int | None) -> None:
+def _require_kind(path: Path, file: BufferedReader, limit: int | None) -> None:
     status = os.fstat(file.fileno())
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path} is no regular file but a device, a pipe or a folder: give a file")
-    if most is not None and status.st_size > most:
+    if limit is not None and status.st_size > limit:
         raise InputError(
-            f"{path} is larger than expected ({status.st_size / 1e6:.0f} MB, at most {most / 1e6:.0f}): is it another "
+            f"{path} is larger than expected ({status.st_size / 1e6:.0f} MB, at most {limit / 1e6:.0f}): is it another "
             "file's name?"
         )
 
@@ -112,15 +112,15 @@ def _require_content(path: Path, file: BufferedReader) -> None:
     file.seek(0)
 
 
-def require_file(path: Path, most: int | None = None) -> int:
+def require_file(path: Path, limit: int | None = None) -> int:
     """The size in bytes of a file that can be opened, for libraries that open it themselves. Raises as `opened`."""
-    with opened(path, most) as file:
+    with opened(path, limit) as file:
         return os.fstat(file.fileno()).st_size
 
 
-def read_bytes(path: Path, most: int | None = None) -> bytes:
+def read_bytes(path: Path, limit: int | None = None) -> bytes:
     """Read a whole file. Raises as `opened`."""
-    with opened(path, most) as file:
+    with opened(path, limit) as file:
         return file.read()
 
 
@@ -147,7 +147,7 @@ def require_listable(paths: Iterable[Path]) -> None:
             raise InputError(f"{path}: a name in this path holds a line break: rename it")
 
 
-def inside(root: Path, relative: str, named_by: Path) -> Path:
+def resolve_within(root: Path, relative: str, named_by: Path) -> Path:
     """`root / relative`, where `named_by` is the file that says so.
 
     Raises InputError when the name leads out of `root`, by `..` or as an absolute path: data from others must not
@@ -175,7 +175,7 @@ def named_file(places: Sequence[Path], name: str, named_by: Path, shorten: bool 
     parts = posixpath.normpath(name.replace("\\", "/")).split("/")
     parts = [part for part in parts if part not in ("", ".", "..") and not part.endswith(":")]
     for first in range(len(parts) if shorten else min(len(parts), 1)):
-        files = (inside(place, "/".join(parts[first:]), named_by) for place in places)
+        files = (resolve_within(place, "/".join(parts[first:]), named_by) for place in places)
         if found := next((file for file in files if file.is_file()), None):
             return found
     return None

@@ -25,11 +25,11 @@ from .reading import opened, parsing, require_file
 _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")
 _HEADER_4 = struct.Struct("<4sIIBBBBI12x")
-_MOST_STREAMS = 16
-_MOST_DEGREE = 4
-_LEAST_BYTES = 19
-_MOST_FRACTION_BITS = 24
-_LEAST_LIMIT, _HIGHEST_RATIO = 32 << 20, 30
+_MAX_STREAMS = 16
+_MAX_DEGREE = 4
+_MIN_BYTES = 19
+_MAX_FRACTION_BITS = 24
+_MIN_LIMIT, _MAX_RATIO = 32 << 20, 30
 """Bytes that any file may unpack to, and how often its own size: real maps pack to a half, bombs to a thousandth."""
 _COLOR_SCALE = 0.15
 # SPZ keeps x right, y up, z back; splat PLYs and this program x right, y down, z forward.
@@ -94,35 +94,35 @@ def read_spz(path: Path) -> GaussianCloud:
 
 def read_spz_stream(plain: BinaryIO, size: int, path: Path) -> GaussianCloud:
     """`read_spz` of `size` bytes that lie open; `path` is for messages. Damage raises whatever comes of it too."""
-    most = max(_LEAST_LIMIT, size * _HIGHEST_RATIO)
+    limit = max(_MIN_LIMIT, size * _MAX_RATIO)
     is_plain = plain.read(4) == _MAGIC
     plain.seek(0)
     if is_plain:
-        return _read_version_4(plain, path, most)
+        return _read_version_4(plain, path, limit)
     with gzip.open(plain, "rb") as file:
         magic, version, count, degree, fraction_bits, _, _ = _HEADER.unpack(file.read(_HEADER.size))
-        _require_sane(path, magic == _MAGIC and version in (2, 3), count, degree, fraction_bits, most)
+        _require_sane(path, magic == _MAGIC and version in (2, 3), count, degree, fraction_bits, limit)
         streams = [_fields(file, count, width) for width in (9, 1, 3, 3, 3 if version == 2 else 4)]
     return _unpacked(streams, fraction_bits)
 
 
-def _read_version_4(file: BinaryIO, path: Path, most: int) -> GaussianCloud:
+def _read_version_4(file: BinaryIO, path: Path, limit: int) -> GaussianCloud:
     _, version, count, degree, fraction_bits, _, number, table = _HEADER_4.unpack(file.read(_HEADER_4.size))
-    _require_sane(path, version == 4 and 5 <= number <= _MOST_STREAMS, count, degree, fraction_bits, most)
+    _require_sane(path, version == 4 and 5 <= number <= _MAX_STREAMS, count, degree, fraction_bits, limit)
     file.seek(table)
     sizes = [struct.unpack("<QQ", file.read(16))[0] for _ in range(number)]
     streams = []
     for packed, width in zip(sizes, (9, 1, 3, 3, 4), strict=False):
-        data = io.BytesIO(file.read(min(packed, most)))
+        data = io.BytesIO(file.read(min(packed, limit)))
         with zstandard.ZstdDecompressor().stream_reader(data) as stream:
             streams.append(_fields(stream, count, width))
     return _unpacked(streams, fraction_bits)
 
 
-def _require_sane(path: Path, known: bool, count: int, degree: int, fraction_bits: int, most: int) -> None:
-    if not known or degree > _MOST_DEGREE:
+def _require_sane(path: Path, known: bool, count: int, degree: int, fraction_bits: int, limit: int) -> None:
+    if not known or degree > _MAX_DEGREE:
         raise InputError(f"{path} is no SPZ file of version 2 to 4: export it with another program's default settings")
-    if count * _LEAST_BYTES > most or fraction_bits > _MOST_FRACTION_BITS:
+    if count * _MIN_BYTES > limit or fraction_bits > _MAX_FRACTION_BITS:
         raise InputError(f"{path} declares {count} Gaussians, more than it can contain: it is damaged")
 
 

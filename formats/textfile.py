@@ -19,7 +19,7 @@ from .reading import parsing, read_bytes
 
 MAX_JSON_BYTES = 32 * 1024 * 1024
 MAX_TOML_BYTES = 1024 * 1024
-_MOST_DIGITS = 40
+_MAX_DIGITS = 40
 _DEEPEST_KEY, _KEY_ENDS = 64, re.compile(r"[=\n,\[{]")
 _NO_KEY = re.compile(r"""#[^\n]*|\"{3}(?:[^\\]|\\.)*?\"{3}|'{3}.*?'{3}|"(?:[^"\\\n]|\\.)*"|'[^'\n]*'""", re.DOTALL)
 """A comment or a string of TOML: dots in it divide no key."""
@@ -31,12 +31,12 @@ MAX_TEXT_BYTES = 48 * 1024 * 1024
 _COMMENT = re.compile(r"^\s*//|(?:^|\s)#")
 
 
-def read_text(path: Path, most: int | None = MAX_TEXT_BYTES) -> str:
+def read_text(path: Path, limit: int | None = MAX_TEXT_BYTES) -> str:
     """The text of a UTF-8 file, or one of UTF-16 that begins with its mark, as PowerShell writes.
 
-    Raises InputError when it is missing, binary, or larger than `most` bytes.
+    Raises InputError when it is missing, binary, or larger than `limit` bytes.
     """
-    data = read_bytes(path, most)
+    data = read_bytes(path, limit)
     is_wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     text = data.removeprefix(codecs.BOM_UTF8).decode("utf-16" if is_wide else "utf-8", errors="replace")
     if "\0" in text[:4096]:
@@ -86,15 +86,15 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
-def read_json(path: Path, most: int | None = MAX_JSON_BYTES, *, allow_nan: bool = False) -> Any:
+def read_json(path: Path, limit: int | None = MAX_JSON_BYTES, *, allow_nan: bool = False) -> Any:
     """Read a JSON file: numbers must be finite and of at most 40 digits, texts valid Unicode.
 
     With `allow_nan` NaN and Infinity pass, which many programs write into poses they have lost.
 
-    Raises InputError when it is missing, larger than `most` bytes (None, for what a run holds: of any size), damaged,
+    Raises InputError when it is missing, larger than `limit` bytes (None, for what a run holds: of any size), damaged,
     or nested too deep.
     """
-    text = read_text(path, most)
+    text = read_text(path, limit)
     with parsing(path, "valid JSON", "was it cut short or edited by hand?"):
         value = json.loads(
             text, parse_constant=float if allow_nan else _refuse, parse_float=_finite, parse_int=_integer
@@ -104,9 +104,9 @@ def read_json(path: Path, most: int | None = MAX_JSON_BYTES, *, allow_nan: bool 
     return value
 
 
-def read_json_object(path: Path, most: int | None = MAX_JSON_BYTES, *, allow_nan: bool = False) -> dict[str, Any]:
+def read_json_object(path: Path, limit: int | None = MAX_JSON_BYTES, *, allow_nan: bool = False) -> dict[str, Any]:
     """The object in a JSON file. Raises InputError as `read_json`, and when it holds something else."""
-    value = read_json(path, most, allow_nan=allow_nan)
+    value = read_json(path, limit, allow_nan=allow_nan)
     if not isinstance(value, dict):
         raise InputError(f"{path} holds a {type(value).__name__}, expected an object in braces")
     return value
@@ -128,12 +128,12 @@ def _refuse(word: str) -> NoReturn:
 def _finite(digits: str) -> float:
     value = float(digits)
     if not math.isfinite(value):
-        raise ValueError(f"the number {digits[:_MOST_DIGITS]} is too large")
+        raise ValueError(f"the number {digits[:_MAX_DIGITS]} is too large")
     return value
 
 
 def _integer(digits: str) -> int:
-    if len(digits) > _MOST_DIGITS:
+    if len(digits) > _MAX_DIGITS:
         raise ValueError(f"a number of {len(digits)} digits")
     return int(digits)
 

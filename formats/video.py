@@ -47,7 +47,7 @@ MAX_FRAME_PIXELS = 64_000_000
 _OPTIONS_VARIABLE = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 _SNIFFED_BYTES = 4096
 _UNKNOWN_RATE = 30.0
-_MOST_RATE = 10_000.0
+_MAX_RATE = 10_000.0
 """A larger one is a clock's unit and no number of frames a second."""
 _SHORTEST_STEP = 1e-6
 _FIRST_FRAMES = 8
@@ -349,7 +349,7 @@ def _read_info(capture: cv2.VideoCapture | AvCapture, path: Path, display: Displ
             "the file is damaged, or scale it down with `ffmpeg -i IN -vf scale=1920:-2 OUT.mp4`"
         )
     count, fps = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
-    if not 0 < fps < _MOST_RATE:
+    if not 0 < fps < _MAX_RATE:
         return VideoInfo(width, height, 0, _UNKNOWN_RATE)
     return VideoInfo(width, height, int(count) if math.isfinite(count) and count > 0 else 0, fps)
 

@@ -47,8 +47,8 @@ _LISTEN = (
 )
 
 WHOLE, PART = "equirectangular", "part of a sphere"
-_MOST_OF_MOOV = 64 << 20
-_MOST_BOXES = 10_000
+_MAX_MOOV_BYTES = 64 << 20
+_MAX_BOXES = 10_000
 _FIRST_BOXES = (b"ftyp", b"styp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot", b"uuid")
 """One of these is at the start of an MP4 or MOV; a raw stream of H.264 or HEVC looks like a box of another kind."""
 _PROJECTION = re.compile(rb"ProjectionType\W{1,4}([a-z]+)")
@@ -229,7 +229,7 @@ def read_moov(path: Path) -> bytes:
     """The head of an MP4 or MOV, at most 64 MB of it; nothing for any other file, or where a length is damaged."""
     end = path.stat().st_size
     with open(path, "rb") as file:
-        for _ in range(_MOST_BOXES):
+        for _ in range(_MAX_BOXES):
             start = file.tell()
             head = file.read(8)
             size, kind = struct.unpack(">I4s", head) if len(head) == 8 else (0, b"")
@@ -238,7 +238,7 @@ def read_moov(path: Path) -> bytes:
             if size == 1:
                 size = int.from_bytes(file.read(8), "big")
             if kind == b"moov":
-                return file.read(min(max(0, start + size - file.tell()), _MOST_OF_MOOV))
+                return file.read(min(max(0, start + size - file.tell()), _MAX_MOOV_BYTES))
             if size < file.tell() - start or start + size >= end:
                 break
             file.seek(start + size)

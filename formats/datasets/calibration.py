@@ -31,7 +31,7 @@ _PARTS = ("projection_parameters", "distortion_parameters")
 _SIDES = (("width", "w", "image_width", "imagewidth"), ("height", "h", "image_height", "imageheight"))
 _SIZE = ("resolution", "image_size", "imagesize", "size")
 _KITTI = re.compile(r"^(P|K|cam|[PK]_|P_rect_)\d*$")
-_DEEPEST, _LARGEST, _MOST = 8, 2_000_000, 1000
+_MAX_DEPTH, _MAX_BYTES, _MAX_CAMERAS = 8, 2_000_000, 1000
 
 
 def read_calibration_file(path: Path, size: tuple[int, int]) -> dict[str, Camera]:
@@ -40,7 +40,7 @@ def read_calibration_file(path: Path, size: tuple[int, int]) -> dict[str, Camera
     Raises InputError for a file without any, a lens that is not supported, and coefficients that would be lost.
     """
     suffix, found = path.suffix.lower(), dict[str, Camera]()
-    data = read_bytes(path, _LARGEST)
+    data = read_bytes(path, _MAX_BYTES)
     with parsing(path, "calibration file", f"files that work: {FORMATS}"):
         if suffix == ".bin":
             return {str(i): _colmap(model, (w, h, *params), path) for i, model, w, h, params in cameras_in(data)}
@@ -129,7 +129,7 @@ def _collect(value: Any, name: str, found: dict[str, Camera], path: Path, size: 
     """Add the cameras of a table and of the tables in it to those found, by the path of their keys."""
     if isinstance(value, list) and _numbers(value) is None:
         value = {str(i): inner for i, inner in enumerate(value)}
-    if not isinstance(value, dict) or name.count("/") > _DEEPEST or len(found) > _MOST:
+    if not isinstance(value, dict) or name.count("/") > _MAX_DEPTH or len(found) > _MAX_CAMERAS:
         return
     table = {str(key).removeprefix("Camera.").removeprefix("Camera1.").lower(): v for key, v in value.items()}
     for inner in [table.get(key) for key in (*_MATRIX, *_DISTORTION, *_PARTS)]:

@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..colmap import ColmapModel, model_suffix, read_colmap_model
+from ..colmap import MODEL_FOLDERS, ColmapModel, model_suffix, read_colmap_model
 from ..errors import InputError
 from ..image_folder import natural_key
-from ..reading import inside, named_file
+from ..reading import named_file, resolve_within
 from .matching import times_or_frame_numbers
 from .sequence import Camera, Sequence
 
-_MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0")
 _IMAGE_FOLDERS = ("images", "frames", ".", "rgb")
 _LEVELS_UP = 3
 
@@ -63,7 +62,7 @@ def open_colmap(path: Path) -> Sequence:
 def _find_model(path: Path) -> Path | None:
     if not path.is_dir():
         return None
-    usual = [path / name for name in _MODEL_FOLDERS]
+    usual = [path / name for name in MODEL_FOLDERS]
     others = sorted(p for p in path.iterdir() if p.is_dir())
     return next((p for p in (*usual, *others) if model_suffix(p)), None)
 
@@ -79,7 +78,7 @@ def _find_images(path: Path, model_folder: Path, model: ColmapModel) -> tuple[Pa
             best = missing.index(min(missing))
             for name, file in zip(model.names, found[best], strict=True):
                 if file is None:
-                    inside(places[best], name, model_folder)
+                    resolve_within(places[best], name, model_folder)
             return places[best], found[best]
     raise InputError(
         f"none of the {len(model.names)} images of the COLMAP model in {model_folder} is found (first: "

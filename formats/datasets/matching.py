@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..image_folder import frame_number, natural_key, read_image_times
 from ..images import IMAGE_SUFFIXES
-from ..reading import inside
+from ..reading import resolve_within
 from ..textfile import read_rows
 from .sequence import LabelClass, used_label_ids
 
@@ -22,7 +22,7 @@ ASSUMED_RATE = 30.0
 SAME_INSTANT_SECONDS = 0.02
 """Two sensors' measurements at most this far apart belong together: half a frame at 25 a second."""
 
-_MOST_IMAGES_SEARCHED = 300
+_MAX_IMAGES_SEARCHED = 300
 
 
 def read_timed_files(
@@ -39,7 +39,9 @@ def read_timed_files(
         raise InputError(f"{path}: a line is not {line} ({error}): unpack the data set again") from error
     if not entries:
         raise InputError(f"{path} lists no files: unpack the data set again")
-    return np.array([time for time, _ in entries], np.float64), [inside(folder, file, path) for _, file in entries]
+    return np.array([time for time, _ in entries], np.float64), [
+        resolve_within(folder, file, path) for _, file in entries
+    ]
 
 
 def files_for_images(images: list[Path], folder: Path, pattern: str = "*") -> tuple[Path | None, ...]:
@@ -121,10 +123,10 @@ def times_or_frame_numbers(images: list[Path]) -> tuple[NDArray[np.float64], boo
 def classes_found(paths: tuple[Path | None, ...]) -> tuple[LabelClass, ...]:
     """A class for every id that occurs in the label images, named by its number: for sets that name none.
 
-    Of long sequences some `_MOST_IMAGES_SEARCHED` evenly spread images are looked at.
+    Of long sequences some `_MAX_IMAGES_SEARCHED` evenly spread images are looked at.
     """
     existing = [p for p in paths if p is not None]
-    used = used_label_ids(existing[:: max(1, len(existing) // _MOST_IMAGES_SEARCHED)])
+    used = used_label_ids(existing[:: max(1, len(existing) // _MAX_IMAGES_SEARCHED)])
     return tuple(LabelClass(i, f"class {i}") for i in sorted(used - {0}))
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from ...formats.reconstruction import pose_of
+from ...formats.colmap import pose_of
 from ..engine.stages import StageContext
 from ..geometry.sparse_model import SparseModel
 from ..run.before import Before

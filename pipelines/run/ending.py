@@ -53,7 +53,7 @@ def find_sealed(run: RunFolder, name: str, fingerprint: str) -> StageRecord | No
     or a file is not as it says."""
     for folder in (run.partial(name), run.stage(name)):
         with suppress(InputError), parsing(folder / RECORD, "record of a stage"):
-            record = dataclass_from_json(StageRecord, read_json_object(folder / RECORD, most=None))
+            record = dataclass_from_json(StageRecord, read_json_object(folder / RECORD, limit=None))
             if record.fingerprint != fingerprint or content_digest(record.files) != record.content:
                 continue
             found = results(folder)

@@ -58,7 +58,7 @@ class Manifest:
 def read_manifest(path: Path) -> Manifest:
     """Raises InputError when it is missing, damaged, or of a newer version."""
     try:
-        value = read_json_object(path, most=None)  # its checksum is in it
+        value = read_json_object(path, limit=None)  # its checksum is in it
         with parsing(path, "manifest of a run", "it was damaged or edited"):
             return _manifest(path, value)
     except InputError as error:

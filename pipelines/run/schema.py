@@ -78,7 +78,7 @@ class RunFile(Generic[T]):
 
 
 _FORMATS: dict[str, tuple[Callable[[Path], Any], Callable[[Path, Any], None]]] = {
-    ".json": (partial(read_json, most=None), write_json),
+    ".json": (partial(read_json, limit=None), write_json),
     ".npz": (partial(load_arrays, own=True), save_arrays),
     ".png": (read_grey_png, write_grey_png),
     ".safetensors": (load_tensors, save_tensors),

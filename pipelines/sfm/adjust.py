@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from ...formats.reconstruction import ModelArrays
+from ...formats.colmap import ModelArrays
 from .lens import set_lens
 
 CAUCHY_PX = 1.0

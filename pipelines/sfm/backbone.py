@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from ...formats.reconstruction import ModelArrays
+from ...formats.colmap import ModelArrays
 from ..geometry.sparse_model import SparseModel
 from .lens import Lens
 

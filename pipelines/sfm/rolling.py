@@ -17,8 +17,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from ...formats.colmap import ModelArrays
 from ...formats.errors import InputError
-from ...formats.reconstruction import ModelArrays
 from ..geometry import se3
 from ..types import Intrinsics
 from . import bundle_kernels as kernels

@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from ...formats.reconstruction import pose_of, set_pose
+from ...formats.colmap import pose_of, set_pose
 from .adjust import filter_outliers, solve
 from .consistency import ModelReport, judge
 from .given import complete_tracks

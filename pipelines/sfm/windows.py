@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from ...formats.reconstruction import pose_of, set_pose
+from ...formats.colmap import pose_of, set_pose
 from ..geometry import se3
 from ..geometry.se3 import Similarity, best_rotation
 from .adjust import LOSS_SD, filter_outliers, median_error

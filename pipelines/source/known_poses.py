@@ -53,7 +53,7 @@ def given_poses(
         warn(f"--poses {config.poses}: {file.lost} of its poses are not finite, as lost tracking is written: left out")
     cam_from_world = np.full_like(found, np.nan)
     cam_from_world[known] = se3.inverse(found[known])
-    return GivenPoses(cam_from_world, file.is_metric, file.what)
+    return GivenPoses(cam_from_world, file.is_metric, file.kind)
 
 
 def check_poses(config: FramesConfig, source: AnySource) -> None:

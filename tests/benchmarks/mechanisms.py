@@ -28,7 +28,7 @@ import numpy as np
 from poses import compare, recordings
 from tracking import Case, in_process, original_names, prepare
 
-from msgs_slam.formats.reconstruction import pose_of
+from msgs_slam.formats.colmap import pose_of
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames import stage as frames_stage
 from msgs_slam.pipelines.frames import tasks

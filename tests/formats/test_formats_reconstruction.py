@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from msgs_slam.formats.reconstruction import ModelArrays, pose_of, set_pose
+from msgs_slam.formats.colmap import ModelArrays, pose_of, set_pose
 
 
 @pytest.fixture

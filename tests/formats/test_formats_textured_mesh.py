@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from msgs_slam.formats.textured_mesh import TexturedMesh, write_textured_glb, write_textured_obj
+from msgs_slam.formats.mesh import TexturedMesh, write_textured_glb, write_textured_obj
 
 COLORS = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 0]], np.uint8)
 

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from ....formats.mesh import MeshArrays
-from ....formats.textured_mesh import TexturedMesh, write_textured_glb, write_textured_obj
+from ....formats.mesh import MeshArrays, TexturedMesh, write_textured_glb, write_textured_obj
 from ...compute.threads import for_each
 from ...geometry.camera import project
 from ...geometry.posed_depth import PosedDepth
