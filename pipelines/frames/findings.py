@@ -11,7 +11,7 @@ import pycolmap
 from ...formats.colmap import pose_of
 from ..engine.stages import StageContext
 from ..geometry.sparse_model import SparseModel
-from ..run.before import Before
+from ..run.extension import ParentRun
 from ..sfm.candidates import GIVEN, GIVEN_ALONE
 from ..sfm.driver import Structure
 from ..sfm.given import agreement
@@ -114,7 +114,7 @@ def warn_of_given(
     }
 
 
-def in_world_of(before: Before, model: SparseModel, frames: Sequence[Frame]) -> SparseModel:
+def in_world_of(before: ParentRun, model: SparseModel, frames: Sequence[Frame]) -> SparseModel:
     """The model moved, turned and scaled to where its keyframes were before; as it is where none tells that."""
     poses = before.poses_of([frames[i] for i in model.frame_ids.tolist()])
     known = np.isfinite(poses).all(axis=(1, 2))

@@ -22,7 +22,7 @@ from ..config import Config
 from ..engine.stages import Stage, StageContext
 from ..engine.tasks import in_chunks
 from ..geometry.rig import Rig, rig_of
-from ..run.before import before_inputs, before_of
+from ..run.extension import parent_inputs, parent_of
 from ..run.files import (
     BACKBONE,
     CALIBRATION,
@@ -164,7 +164,7 @@ def _keyframes(context: StageContext, frames: list[Frame], masks: FrameMasks, ri
     panoramas all sides are keyframes."""
     table = context.snapshot / "keyframes.json"
     if not table.exists():
-        before = before_of(context.source)
+        before = parent_of(context.source)
         chosen, first = ([], 0) if before is None else before.keyframes_of(frames)
         added = _choose(context, frames[first:], masks, rig).keyframes
         chosen += [first + k for k in added]
@@ -192,7 +192,7 @@ def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks, rig: 
     parallax = context.config.frames.parallax
     while True:
         choice = choose_keyframes(pictures(), parallax / across)
-        if not (context.config.frames.poses or before_of(context.source)):
+        if not (context.config.frames.poses or parent_of(context.source)):
             require_motion(choice.largest_displacement * across)
         if len(choice.keyframes) >= min(_FEW_KEYFRAMES, len(places)) or parallax < context.config.frames.parallax / 3:
             return choice
@@ -243,7 +243,7 @@ def _write_backbone(
         return read_rgb(picked(context, frames[frame_id].name))
 
     model = to_sparse_model(structure.model, keyframes, lens, load_rgb)
-    before = before_of(context.source)
+    before = parent_of(context.source)
     BACKBONE.save(context.folder, model if before is None else in_world_of(before, model, frames))
     for number, piece in enumerate(structure.pieces, 2):
         SPARSE.save(context.folder / f"piece_{number}", to_sparse_model(piece, keyframes, lens, load_rgb))
@@ -318,7 +318,7 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
 def _inputs(source: Path, config: Config) -> dict[str, str] | None:
     settings = config.frames
     given = pose_inputs(settings) | intrinsics_inputs(settings.intrinsics)
-    return (mask_inputs(source, config) or {}) | learned_inputs(settings) | given | before_inputs(source) or None
+    return (mask_inputs(source, config) or {}) | learned_inputs(settings) | given | parent_inputs(source) or None
 
 
 def _division(run: RunFolder, config: Config) -> list[range]:

@@ -14,7 +14,7 @@ from ...formats.images import read_rgb
 from ..engine.stages import StageContext
 from ..engine.tasks import Chunk
 from ..geometry.rig import Rig, rig_of
-from ..run.before import before_of
+from ..run.extension import parent_of
 from ..sfm.bridges import Picture
 from ..sfm.calibration import read_intrinsics
 from ..sfm.driver import Divide, StructureFromMotion, when_asked
@@ -44,7 +44,7 @@ def known_camera(context: StageContext, source: AnySource, faces: Faces | None) 
         pinhole = Camera(**asdict(faces.pinhole))
         return to_pycolmap(pinhole), "given"
     width, height = reduced_size(source.width, source.height, config.max_side)
-    before = before_of(context.source)
+    before = parent_of(context.source)
     if before is not None and before.camera.origin != "given":
         return calibrated_camera(before.camera), before.camera.origin
     if config.intrinsics:
@@ -90,7 +90,7 @@ def structure_from_motion(
 ) -> StructureFromMotion:
     """Prepare structure from motion of these frames; `origin` is as in `known_camera`."""
     settings, size = context.config.frames, (camera.width, camera.height)
-    learned, before = open_learned(settings), before_of(context.source)
+    learned, before = open_learned(settings), parent_of(context.source)
     start = given.cam_from_world if given is not None else None
 
     def extract(frame_id: int) -> Features:

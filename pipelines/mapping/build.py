@@ -14,7 +14,7 @@ from ..depth.fields import DepthFields
 from ..engine.stages import StageContext
 from ..geometry.posed_depth import PosedDepth, overlaps
 from ..render.gaussian_map import GaussianMap
-from ..run.before import Before
+from ..run.extension import ParentRun
 from ..run.files import CALIBRATION, CLASS_IDS, DEPTH_FIELDS, EXPOSURE, SUBMAPS
 from ..run.folder import RunFolder
 from ..system.memory import submap_size
@@ -68,7 +68,7 @@ class Refined:
 
 
 def build_map(
-    context: StageContext, trajectory: Trajectory, class_ids: tuple[int, ...], before: Before | None = None
+    context: StageContext, trajectory: Trajectory, class_ids: tuple[int, ...], before: ParentRun | None = None
 ) -> Mapped:
     """The map of the keyframes; channel c of its classes is label class_ids[c]. `before`: the run that this one
     extends, whose map is kept and grown where one submap is all there is."""

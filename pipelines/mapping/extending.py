@@ -13,7 +13,7 @@ from torch import Tensor
 from ..geometry.camera import project
 from ..geometry.posed_depth import overlaps
 from ..render.gaussian_map import GaussianMap, decided_channels
-from ..run.before import Before
+from ..run.extension import ParentRun
 from ..run.files import FRAMES
 from ..sfm.given import agreement
 from ..system.progress import Progress
@@ -57,7 +57,7 @@ def grow_submap(task: SubmapTask, progress: Progress) -> None:
 
 
 def _start(
-    task: SubmapTask, before: Before, exposures: Mapping[int, object]
+    task: SubmapTask, before: ParentRun, exposures: Mapping[int, object]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64], GaussianMap]:
     """Ids (N,) and poses (N, 4, 4) of all keyframes, the rows of those to visit, and the map that is there."""
     views = task.views(task.trajectory).views
@@ -84,7 +84,7 @@ def _exposures(ids: NDArray[np.int64], known: dict[int, tuple[NDArray, NDArray]]
 
 
 def _kept_map(
-    before: Before,
+    before: ParentRun,
     trajectory: Trajectory,
     known: NDArray[np.float64],
     views: Sequence[View],

@@ -9,7 +9,7 @@ from typing import Any
 from ...formats.errors import InputError
 from ..config import Config
 from ..engine.stages import Stage, StageContext
-from ..run.before import before_inputs, before_of
+from ..run.extension import parent_inputs, parent_of
 from ..run.files import CALIBRATION, EXPOSURE, FIGURES, MAP, TRAJECTORY
 from ..run.folder import RunFolder
 from ..system.memory import submap_size
@@ -25,7 +25,7 @@ def run(context: StageContext) -> dict[str, Any]:
     trajectory = context.run.load(TRAJECTORY, "tracking")
     kept, _ = split_frames(trajectory, context.config.mapping.hold_out)
     class_ids = _require_views(context, kept)
-    mapped = build_map(context, trajectory, class_ids, before_of(context.source))
+    mapped = build_map(context, trajectory, class_ids, parent_of(context.source))
     result, ids = mapped.result, mapped.keyframe_ids
     MAP.save(context.folder, result.gaussian_map)
     TRAJECTORY.save(context.folder, mapped.moved)
@@ -77,7 +77,7 @@ def _division(run: RunFolder, config: Config) -> int:
 
 
 def _inputs(source: Path, config: Config) -> dict[str, str] | None:
-    return before_inputs(source) or None
+    return parent_inputs(source) or None
 
 
 STAGE = Stage("mapping", run, inputs=_inputs, division=_division)

@@ -22,7 +22,7 @@ from ..depth.fields import DepthFields
 from ..geometry.posed_depth import PosedDepth
 from ..render.gaussian_map import GaussianMap
 from ..render.inspection import blending_weights, median_depth
-from ..run.before import Before
+from ..run.extension import ParentRun
 from ..run.folder import RunFolder
 from ..system.device import resolve_device
 from ..system.memory import memory_room
@@ -67,7 +67,7 @@ class SubmapTask:
     exposure: Exposures | None = None
     passes: float | None = None
     measured: str = AGREED
-    before: Before | None = None
+    before: ParentRun | None = None
 
     @property
     def device(self) -> str:

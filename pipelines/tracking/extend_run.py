@@ -16,7 +16,7 @@ from ...formats.reading import require_listable
 from ...formats.video import VideoFrame, probe_video
 from ..config import Config, FramesConfig
 from ..frames.learned import open_learned, picture_features
-from ..run.before import FINAL, save_before
+from ..run.extension import FINAL, save_parent
 from ..run.files import CALIBRATION, SPARSE
 from ..run.folder import RunFolder, load_records, load_source
 from ..run.manifest import Manifest, Source, write_manifest
@@ -82,7 +82,7 @@ def add_videos(run: RunFolder, videos: Sequence[Path], config: Config) -> Source
     earlier = sorted(run.root.glob(f"{EXTENSION}*"))
     numbers = [int(n) for p in earlier if (n := p.name.removeprefix(EXTENSION)).isdigit()]
     folder = run.root / f"{EXTENSION}{max(numbers, default=0) + 1}"
-    save_before(run, folder)
+    save_parent(run, folder)
     path = folder / SOURCE_LIST
     write_text(path, "".join(f"{file}\n" for file in [*files, *(v.resolve() for v in videos)]))
     source = Source(str(path.resolve()), source_digest(path, config.run.format))

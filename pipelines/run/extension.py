@@ -41,7 +41,7 @@ FINAL = "global_ba"
 
 
 @dataclass(frozen=True)
-class Before:
+class ParentRun:
     """The files of one extension folder, each checked when it is opened."""
 
     folder: Path
@@ -102,19 +102,19 @@ class Before:
         return dict(zip(rows["frame_ids"].tolist(), zip(rows["log_gains"], rows["offsets"], strict=True), strict=True))
 
 
-def before_of(source: Path) -> Before | None:
+def parent_of(source: Path) -> ParentRun | None:
     """Find the earlier state of the run made from `source`; None where it was never extended."""
     is_extended = source.name == SOURCE_LIST and (source.parent / CONTENTS).is_file()
-    return Before(source.parent) if is_extended else None
+    return ParentRun(source.parent) if is_extended else None
 
 
-def before_inputs(source: Path) -> dict[str, str]:
+def parent_inputs(source: Path) -> dict[str, str]:
     """Return the digest of that state as an input of a stage, {} where there is none."""
-    before = before_of(source)
+    before = parent_of(source)
     return {} if before is None else {"before": file_sha256(before.folder / CONTENTS)}
 
 
-def save_before(run: RunFolder, folder: Path) -> None:
+def save_parent(run: RunFolder, folder: Path) -> None:
     """Write that state into a folder, the table of contents last. Raises InputError where the run is damaged."""
     frames, trajectory, backbone = run.load(FRAMES), run.load(TRAJECTORY, FINAL), run.find(BACKBONE)
     ids = trajectory.frame_ids.tolist()
