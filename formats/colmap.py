@@ -87,7 +87,7 @@ def write_colmap_model(folder: Path, model: ColmapModel) -> None:
 
 
 def read_colmap_model(folder: Path) -> ColmapModel:
-    """The registered images, in order of their names, and the points of a binary or text model in `folder`.
+    """Read the registered images, in order of their names, and the points of a binary or text model in `folder`.
 
     Raises InputError when the folder holds no complete model, or a file of it is damaged or holds what cannot be:
     a pose that is no rigid transform, an image without a size, a value that is not finite.
@@ -137,7 +137,7 @@ def _require_sense(model: ColmapModel, folder: Path) -> None:
 
 
 def model_suffix(folder: Path) -> str | None:
-    """ ".bin" or ".txt" when the folder holds a complete model of that kind, else None."""
+    """Return ".bin" or ".txt" when the folder holds a complete model of that kind, else None."""
     for suffix in (".bin", ".txt"):
         if all((folder / f"{part}{suffix}").is_file() for part in ("cameras", "images", "points3D")):
             return suffix
@@ -400,7 +400,7 @@ class ModelArrays:
         return replace(self, cam_from_world=poses, points=points)
 
     def rows(self) -> list[slice]:
-        """The observations of each image."""
+        """Return the observations of each image."""
         ends = np.searchsorted(self.obs_cam, np.arange(len(self.image_ids) + 1)).tolist()
         return [slice(a, b) for a, b in pairwise(ends)]
 
@@ -415,7 +415,7 @@ def _positions(model: pycolmap.Reconstruction, point_ids: Sequence[int]) -> Arra
 
 
 def pose_of(image: pycolmap.Image) -> Array:
-    """(4, 4) camera from world."""
+    """Return (4, 4) camera from world."""
     return np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
 
 

@@ -47,7 +47,7 @@ class ExifLens:
     camera: str = ""
 
     def focal_px(self, width: int, height: int) -> float | None:
-        """Focal length in pixels of an image of width x height that was resized, but not cropped."""
+        """Return the focal length in pixels of an image of width x height that was resized, but not cropped."""
         stated = self.equivalent or self.by_pitch
         return None if stated is None else stated / _FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
 
@@ -98,7 +98,7 @@ def place_of(tags: _Tags) -> tuple[float, float, float] | None:
 
 
 def positive(value: object) -> float | None:
-    """An EXIF number (int or rational) when it is a usable one."""
+    """Return an EXIF number (int or rational) when it is a usable one."""
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):

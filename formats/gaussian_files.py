@@ -19,7 +19,7 @@ _SMALLEST_SCALE = 1e-9
 
 
 def read_gaussians(path: Path) -> GaussianCloud:
-    """The Gaussians of a .ply, .spz, .splat or .glb file, by its suffix.
+    """Read the Gaussians of a .ply, .spz, .splat or .glb file, by its suffix.
 
     Raises InputError for another suffix, a missing or damaged file, and values that are not finite.
     """
@@ -37,7 +37,7 @@ def read_gaussians(path: Path) -> GaussianCloud:
 
 
 def read_splat(path: Path) -> GaussianCloud:
-    """The Gaussians of a .splat file: 32 bytes each, without header, 8 bit colours and rotations.
+    """Read the Gaussians of a .splat file: 32 bytes each, without header, 8 bit colours and rotations.
 
     Raises InputError when the file is missing, its length is no multiple of 32, or a value is not finite.
     """

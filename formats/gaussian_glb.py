@@ -92,7 +92,7 @@ def write_compressed_glb(path: Path, cloud: GaussianCloud) -> None:
 
 
 def read_gaussian_glb(path: Path) -> GaussianCloud:
-    """The first primitive of Gaussians in a GLB by this or another program; higher harmonics are dropped.
+    """Read the first primitive of Gaussians in a GLB by this or another program; higher harmonics are dropped.
 
     The transforms of nodes are not applied. Raises InputError when the file is missing or damaged, holds no Gaussians,
     or packs them (other extensions, quantised attributes).

@@ -64,7 +64,8 @@ class GaussianCloud:
 
 
 def unit_quaternions(quat: NDArray) -> NDArray[np.float32]:
-    """(M, 4) of length 1: trainers store them as the optimiser left them, packed files rounded. Zero is no rotation."""
+    """Return (M, 4) of length 1: trainers store them as the optimiser left them, packed files rounded. Zero is no
+    rotation."""
     wide = quat.astype(np.float64)
     length = np.linalg.norm(wide, axis=1, keepdims=True)
     identity = np.array([1.0, 0, 0, 0])
@@ -72,7 +73,7 @@ def unit_quaternions(quat: NDArray) -> NDArray[np.float32]:
 
 
 def parts_of(cloud: GaussianCloud | Sequence[GaussianCloud]) -> Sequence[GaussianCloud]:
-    """The parts, at least one, that a cloud is given in: a sequence may make each as it is asked for."""
+    """Return the parts, at least one, that a cloud is given in: a sequence may make each as it is asked for."""
     return [cloud] if isinstance(cloud, GaussianCloud) else cloud
 
 
@@ -83,7 +84,8 @@ def isotropic_cloud(
     colors: NDArray[np.float32],
     class_probs: NDArray[np.float32] | None = None,
 ) -> GaussianCloud:
-    """A cloud of balls: log_radii (M,) on all three axes, no rotation, class ids from the largest probability."""
+    """Return a cloud of balls: log_radii (M,) on all three axes, no rotation, class ids from the largest
+    probability."""
     m = len(means)
     quat_wxyz = np.zeros((m, 4), dtype=np.float32)
     quat_wxyz[:, 0] = 1

@@ -60,9 +60,9 @@ def write_primitive(
     extensions: Sequence[str] = (),
     picture: bytes = b"",
 ) -> None:
-    """A scene of one mesh that is one `primitive` of these parts, class names in the mesh's extras; `name` of mesh and
-    node, `extras` of the document; the bytes of a `picture` are in the buffer view after the parts. Raises ValueError
-    where a part's blocks are not as long as it says, InputError when the disk refuses."""
+    """Write a scene of one mesh that is one `primitive` of these parts, class names in the mesh's extras; `name` of
+    mesh and node, `extras` of the document; the bytes of a `picture` are in the buffer view after the parts. Raises
+    ValueError where a part's blocks are not as long as it says, InputError when the disk refuses."""
     starts = np.cumsum([0, *(part.nbytes for part in parts), len(picture)]).tolist()
     views: list[dict[str, Any]] = [{"buffer": 0, "byteOffset": a, "byteLength": b - a} for a, b in pairwise(starts)]
     accessors = []
@@ -89,7 +89,7 @@ def write_primitive(
 
 
 def write_glb(path: Path, document: dict[str, Any], parts: Sequence[Part], rest: bytes = b"") -> None:
-    """The document, and as its one buffer the parts and then the `rest`; both chunks are padded to four bytes."""
+    """Write the document, and as its one buffer the parts and then the `rest`; both chunks are padded to four bytes."""
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     length = document["buffers"][0]["byteLength"]
@@ -108,8 +108,8 @@ def write_glb(path: Path, document: dict[str, Any], parts: Sequence[Part], rest:
 
 
 def glb_parts(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Document and buffer of a file's bytes. Raises ValueError, or what comes of missing bytes and keys, for another
-    file."""
+    """Return the document and buffer of a file's bytes. Raises ValueError, or what comes of missing bytes and keys, for
+    another file."""
     magic, version, _ = struct.unpack_from("<4sII", data)
     if magic != b"glTF" or version != 2:
         raise ValueError("it does not begin like a GLB of version 2")

@@ -44,7 +44,8 @@ class Track:
     lost: int = 0
 
     def at(self, times: Array, farthest: float) -> Array:
-        """(N, 3) latitude, longitude, altitude at other times, between fixes; NaN more than `farthest` s from one."""
+        """Return (N, 3) latitude, longitude, altitude at other times, between fixes; NaN more than `farthest` s from
+        one."""
         values = np.column_stack([self.degrees, self.altitude])
         out = np.stack([np.interp(times, self.times, column) for column in values.T], axis=1)
         after = np.clip(np.searchsorted(self.times, times), 0, len(self.times) - 1)
@@ -54,7 +55,7 @@ class Track:
 
 
 def photo_places(photos: list[Path | None]) -> Array:
-    """(N, 3) latitude, longitude, altitude from the EXIF of images; NaN where it does not or cannot be read."""
+    """Return (N, 3) latitude, longitude, altitude from the EXIF of images; NaN where it does not or cannot be read."""
     out = np.full((len(photos), 3), np.nan)
     for i, photo in enumerate(photos):
         try:
@@ -67,7 +68,7 @@ def photo_places(photos: list[Path | None]) -> Array:
 
 
 def read_track(path: Path) -> Track:
-    """A GPX track, or a CSV with a header that names time, lat, lon and perhaps alt (seconds, or ISO 8601).
+    """Read a GPX track, or a CSV with a header that names time, lat, lon and perhaps alt (seconds, or ISO 8601).
 
     Rows that are no fix are left out and counted, and of fixes of one time all but one. Raises InputError when the file
     is missing, damaged, of another kind, has fewer than two fixes, or more rows that are none.
@@ -150,13 +151,15 @@ def _seconds(text: str) -> float:
 
 
 def enu_from_geodetic(places: Array, origin: Array) -> Array:
-    """(N, 3) latitude, longitude (degrees), altitude -> (N, 3) metres east, north, up of `origin` (3,), on WGS 84."""
+    """Return (N, 3) latitude, longitude (degrees), altitude -> (N, 3) metres east, north, up of `origin` (3,), on WGS
+    84."""
     earth = ecef_from_enu(origin)
     return np.asarray((_ecef(places) - earth[:3, 3]) @ earth[:3, :3])
 
 
 def ecef_from_enu(origin: Array) -> Array:
-    """(4, 4) from metres east, north, up of `origin` (3,) latitude, longitude, altitude to Earth-centred metres."""
+    """Return (4, 4) from metres east, north, up of `origin` (3,) latitude, longitude, altitude to Earth-centred
+    metres."""
     lat, lon = np.radians(origin[0]), np.radians(origin[1])
     east = np.array([-np.sin(lon), np.cos(lon), 0.0])
     up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])

@@ -17,13 +17,13 @@ _LIST_NAMES = ("timestamps.txt", "times.txt", "rgb.txt")
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sort key under which img2 comes before img10. Raises nothing; equal names have equal keys."""
+    """Return a sort key under which img2 comes before img10. Raises nothing; equal names have equal keys."""
     parts = re.split(r"([0-9]+)", name)
     return tuple((0, int(p), p) if p.isdecimal() and p.isascii() else (1, 0, p) for p in parts)
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files directly in `folder`, in natural order; hidden files are left out.
+    """List the image files directly in `folder`, in natural order; hidden files are left out.
 
     Raises InputError when there is no such folder or no image in it.
     """
@@ -68,7 +68,7 @@ def _why_no_images(folder: Path, files: list[Path]) -> str:
 
 
 def read_image_times(images: list[Path]) -> NDArray[np.float64] | None:
-    """(N,) seconds at which the images were taken, strictly increasing; None where they are unknown.
+    """Read (N,) seconds at which the images were taken, strictly increasing; None where they are unknown.
 
     Looks for timestamps.txt, times.txt or rgb.txt in the images' folder, then in the one above: a number a line for
     each image in order, or for each frame number in the images' names; or lines of `seconds name`. Else EXIF.
@@ -82,14 +82,15 @@ def read_image_times(images: list[Path]) -> NDArray[np.float64] | None:
 
 
 def times_file(folder: Path) -> Path | None:
-    """The list of times that belongs to the images of a folder, None where there is none."""
+    """Return the list of times that belongs to the images of a folder, None where there is none."""
     places = (place / name for place in (folder, folder.parent) for name in _LIST_NAMES)
     with reaching(folder):
         return next((path for path in places if path.is_file()), None)
 
 
 def frame_number(path: Path) -> int | None:
-    """The last run of digits in a file name without its suffixes (frame-000012.color.jpg: 12), None without one."""
+    """Return the last run of digits in a file name without its suffixes (frame-000012.color.jpg: 12), None without
+    one."""
     digits = re.findall(r"[0-9]+", path.name.split(".")[0])
     return int(digits[-1]) if digits else None
 

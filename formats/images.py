@@ -48,7 +48,8 @@ RAW_SUFFIXES = frozenset({".dng", ".cr2", ".nef", ".arw", ".raw"})
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) from the header, after the rotation stated in EXIF. Raises InputError as `read_rgb` does."""
+    """Return (width, height) from the header, after the rotation stated in EXIF. Raises InputError as `read_rgb`
+    does."""
     return read_header(path).size
 
 
@@ -62,7 +63,7 @@ def first_readable(paths: Sequence[Path]) -> Path:
 
 
 def is_depth_map(path: Path) -> bool:
-    """Whether the header says one channel of more than 8 bits; False for a file that cannot be read."""
+    """Return whether the header says one channel of more than 8 bits; False for a file that cannot be read."""
     try:
         with _opened(Path(path)) as image:
             return is_one_deep_channel(image)
@@ -71,8 +72,8 @@ def is_depth_map(path: Path) -> bool:
 
 
 def is_plain(path: Path) -> bool:
-    """Whether other programs see the image as it is seen here: a JPEG or PNG, whatever it is called, neither turned nor
-    transparent, 8 bits a channel.
+    """Return whether other programs see the image as it is seen here: a JPEG or PNG, whatever it is called, neither
+    turned nor transparent, 8 bits a channel.
 
     Raises InputError as `read_rgb` does.
     """
@@ -96,7 +97,8 @@ AS_STATED = Reading()
 
 
 def read_rgb(path: Path, reading: Reading = AS_STATED) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB, turned upright as EXIF or HEIF says; more bits become 8, grey is tripled, alpha dropped.
+    """Read (H, W, 3) uint8 RGB, turned upright as EXIF or HEIF says; more bits become 8, grey is tripled, alpha
+    dropped.
 
     Raises InputError for a missing, truncated, oversized or unreadable file.
     """
@@ -110,7 +112,7 @@ def read_rgb(path: Path, reading: Reading = AS_STATED) -> NDArray[np.uint8]:
 
 
 def read_transparent(path: Path, reading: Reading = AS_STATED) -> NDArray[np.bool_] | None:
-    """(H, W) pixels of `read_rgb` that are less than half opaque; None where all are opaque. Raises the same."""
+    """Read (H, W) pixels of `read_rgb` that are less than half opaque; None where all are opaque. Raises the same."""
     with _opened(Path(path)) as image:
         if image.mode in ("RGB", "L") and "transparency" not in image.info:
             return None
@@ -120,7 +122,8 @@ def read_transparent(path: Path, reading: Reading = AS_STATED) -> NDArray[np.boo
 
 
 def read_deep(path: Path) -> NDArray | None:
-    """(H, W) or (H, W, 3) values of more than 8 bits as stored; None for other images. Raises as `read_rgb` does."""
+    """Read (H, W) or (H, W, 3) values of more than 8 bits as stored; None for other images. Raises as `read_rgb`
+    does."""
     with _opened(Path(path)) as image:
         if is_deep_colour(image):
             return decode_16_bits(read_bytes(Path(path)))
@@ -129,7 +132,8 @@ def read_deep(path: Path) -> NDArray | None:
 
 
 def read_depth_png(path: Path) -> NDArray[np.uint16]:
-    """(H, W) uint16 depth in the file's own unit. Raises InputError unless the file holds one channel of 16 bits."""
+    """Read (H, W) uint16 depth in the file's own unit. Raises InputError unless the file holds one channel of 16
+    bits."""
     values = _read_one_channel(Path(path), "depth")
     if values.dtype == np.uint8:
         raise InputError(f"{path} has 8 bits a pixel, depth needs 16: was it saved as a preview image?")
@@ -137,12 +141,12 @@ def read_depth_png(path: Path) -> NDArray[np.uint16]:
 
 
 def read_label_png(path: Path) -> NDArray[np.uint16]:
-    """(H, W) uint16 label ids as stored; of a palette image the indices. Raises InputError for a colour image."""
+    """Read (H, W) uint16 label ids as stored; of a palette image the indices. Raises InputError for a colour image."""
     return _read_one_channel(Path(path), "labels").astype(np.uint16)
 
 
 def read_grey_png(path: Path) -> NDArray[np.float32]:
-    """(H, W) float32 in [0, 1] of an 8 or 16 bit one-channel image, such as a confidence map."""
+    """Read (H, W) float32 in [0, 1] of an 8 or 16 bit one-channel image, such as a confidence map."""
     values = _read_one_channel(Path(path), "confidence")
     return values.astype(np.float32) / np.float32(255 if values.dtype == np.uint8 else 65535)
 
@@ -177,7 +181,7 @@ def _save(path: Path, image: Image.Image, **options: Any) -> None:
 
 
 def jpeg_bytes(rgb: NDArray[np.uint8], quality: int = 90) -> bytes:
-    """(H, W, 3) uint8 as a JPEG with full colour resolution, for files that hold others."""
+    """Encode (H, W, 3) uint8 as a JPEG with full colour resolution, for files that hold others."""
     return _encoded(Image.fromarray(np.ascontiguousarray(rgb)), format="JPEG", quality=quality, subsampling=0)
 
 
@@ -188,7 +192,7 @@ def _encoded(image: Image.Image, **options: Any) -> bytes:
 
 
 def decode_rgb(data: bytes, name: str) -> NDArray[np.uint8]:
-    """`read_rgb` for an image held in memory; `name` is what errors call it."""
+    """Decode an image held in memory as `read_rgb` does; `name` is what errors call it."""
     with parsing(name, "image", _ADVICE), _quiet_open(io.BytesIO(data)) as image:
         _require_sane_size(image, name)
         return to_rgb8(image)
@@ -212,7 +216,7 @@ class Header:
 
 
 def read_header(path: Path) -> Header:
-    """Header of an image. Raises InputError as `read_rgb` does."""
+    """Read the header of an image. Raises InputError as `read_rgb` does."""
     with _opened(Path(path)) as image:
         deep = is_one_deep_channel(image) or is_deep_colour(image)  # first: asking a PNG for EXIF loads it
         lens = lens_of(_tags(image), _tags(image, ExifTags.IFD.Exif), image.size)
@@ -223,7 +227,7 @@ def read_header(path: Path) -> Header:
 
 
 def exif_focal_px(path: Path, width: int, height: int) -> float | None:
-    """Focal length in pixels of an image of width x height, from EXIF; None when EXIF states none.
+    """Return the focal length in pixels of an image of width x height, from EXIF; None when EXIF states none.
 
     From the 35 mm equivalent (over the diagonal, as the makers define it for other aspect ratios than 3:2), else
     from the focal length and the sensor's pixel pitch. The image may have been resized since, but not cropped.
@@ -232,7 +236,8 @@ def exif_focal_px(path: Path, width: int, height: int) -> float | None:
 
 
 def exif_time(path: Path) -> float | None:
-    """Seconds (of the camera's own clock, since 1970) when the image was taken, from EXIF; None when missing."""
+    """Return the seconds (of the camera's own clock, since 1970) when the image was taken, from EXIF; None when
+    missing."""
     with _opened(Path(path)) as image:
         tags = _tags(image, ExifTags.IFD.Exif)
     text = tags.get(ExifTags.Base.DateTimeOriginal)
@@ -246,7 +251,8 @@ def exif_time(path: Path) -> float | None:
 
 
 def exif_gps(path: Path) -> tuple[float, float, float] | None:
-    """(latitude, longitude, altitude) in degrees and metres that EXIF states; altitude NaN, all None where missing."""
+    """Return (latitude, longitude, altitude) in degrees and metres that EXIF states; altitude NaN, all None where
+    missing."""
     with _opened(Path(path)) as image:
         tags = _tags(image, ExifTags.IFD.GPSInfo)
     return place_of(tags)
@@ -321,7 +327,7 @@ def _require_sane_size(image: Image.Image, name: str) -> None:
 
 
 def to_rgb8(image: Image.Image, span: tuple[float, float] | None = None) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB of a loaded image; grey is tripled, alpha dropped.
+    """Return (H, W, 3) uint8 RGB of a loaded image; grey is tripled, alpha dropped.
 
     `span`: the values of a deep image that become 0 and 255, by default those of 16 bits (of floats the image's own).
     What is not finite becomes 0. Raises ValueError for a pixel format that has no conversion.
@@ -340,7 +346,7 @@ def to_rgb8(image: Image.Image, span: tuple[float, float] | None = None) -> NDAr
 
 
 def transparent_pixels(image: Image.Image) -> NDArray[np.bool_] | None:
-    """(H, W) pixels that are less than half opaque; None for a format without alpha, or an image that is opaque
+    """Return (H, W) pixels that are less than half opaque; None for a format without alpha, or an image that is opaque
     everywhere."""
     if is_one_deep_channel(image) or (image.mode not in _ALPHA_MODES and "transparency" not in image.info):
         return None
@@ -350,17 +356,17 @@ def transparent_pixels(image: Image.Image) -> NDArray[np.bool_] | None:
 
 
 def is_one_deep_channel(image: Image.Image) -> bool:
-    """Whether the pixels are one number of more than 8 bits."""
+    """Return whether the pixels are one number of more than 8 bits."""
     return image.mode.startswith("I") or image.mode == "F"
 
 
 def deep_values(image: Image.Image) -> NDArray | None:
-    """(H, W) of one deep channel, or (H, W, 3) of three of 16 bits; None for other formats."""
+    """Return (H, W) of one deep channel, or (H, W, 3) of three of 16 bits; None for other formats."""
     return np.asarray(image) if is_one_deep_channel(image) else None
 
 
 def is_deep_colour(image: Image.Image) -> bool:
-    """Whether an unloaded PNG or TIFF stores three or four channels of 16 bits, of which Pillow keeps the high
+    """Return whether an unloaded PNG or TIFF stores three or four channels of 16 bits, of which Pillow keeps the high
     bytes."""
     return (
         image.format in ("PNG", "TIFF") and image.mode in ("RGB", "RGBA") and ";16" in str(getattr(image, "tile", ""))
@@ -368,12 +374,12 @@ def is_deep_colour(image: Image.Image) -> bool:
 
 
 def decode_deep_colour(data: bytes, span: tuple[float, float]) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 of a PNG or TIFF of three or four channels of 16 bits, not turned."""
+    """Return (H, W, 3) uint8 of a PNG or TIFF of three or four channels of 16 bits, not turned."""
     return _scaled(decode_16_bits(data), span)
 
 
 def decode_16_bits(data: bytes) -> NDArray[np.uint16]:
-    """(H, W, 3) uint16 RGB of a PNG or TIFF, not turned. Raises ValueError where it cannot be decoded."""
+    """Return (H, W, 3) uint16 RGB of a PNG or TIFF, not turned. Raises ValueError where it cannot be decoded."""
     found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if found is None or found.ndim != 3 or found.dtype != np.uint16:
         raise ValueError("its 16 bit channels cannot be decoded")

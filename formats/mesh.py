@@ -91,7 +91,7 @@ def _face_rows(faces: NDArray[np.int32], count: int) -> NDArray[Any]:
 
 
 def mesh_blocks(path: Path) -> MeshBlocks:
-    """The mesh of a PLY by `write_mesh_ply`. Raises InputError for another file."""
+    """Return the mesh of a PLY by `write_mesh_ply`. Raises InputError for another file."""
     listed = np.dtype([("length", "u1"), *_FACE.descr])
     vertex, face = read_rows(path, {"vertex": _VERTEX, "face": listed}).values()
 
@@ -104,7 +104,7 @@ def mesh_blocks(path: Path) -> MeshBlocks:
 
 
 def read_mesh_ply(path: Path) -> MeshArrays:
-    """A triangle mesh from a PLY by this or another program; polygons are cut into triangle fans.
+    """Read a triangle mesh from a PLY by this or another program; polygons are cut into triangle fans.
 
     Vertices without colours are grey, without labels 255. Raises InputError for a file that is no mesh.
     """
@@ -198,7 +198,7 @@ class TexturedMesh:
 
 
 def write_textured_obj(path: Path, mesh: TexturedMesh, class_names: tuple[str, ...] = ()) -> list[Path]:
-    """The OBJ, its material and its image beside it, of the same stem; a group a class (of each face's first
+    """Write the OBJ, its material and its image beside it, of the same stem; a group a class (of each face's first
     vertex). The same mesh gives the same bytes. Raises InputError when the disk refuses.
     """
     path = Path(path)
@@ -221,7 +221,7 @@ def write_textured_obj(path: Path, mesh: TexturedMesh, class_names: tuple[str, .
 
 
 def write_textured_glb(path: Path, mesh: TexturedMesh, class_names: tuple[str, ...] = ()) -> None:
-    """A GLB with the texture as a JPEG, shown as it is (KHR_materials_unlit), labels as attribute _LABEL.
+    """Write a GLB with the texture as a JPEG, shown as it is (KHR_materials_unlit), labels as attribute _LABEL.
 
     glTF wants y up: the caller turns the vertices. The same mesh gives the same bytes. Raises InputError when the disk
     refuses.

@@ -49,7 +49,7 @@ _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int
 
 
 def read_ply(path: Path) -> PlyData:
-    """A PLY file by plyfile. Raises InputError when it is missing, a git-LFS pointer, no PLY, or cut short."""
+    """Read a PLY file by plyfile. Raises InputError when it is missing, a git-LFS pointer, no PLY, or cut short."""
     with opened(path) as file:
         head = file.read(_MAX_HEADER_BYTES)
     if not head.startswith(b"ply"):
@@ -102,7 +102,7 @@ def slices(count: int) -> Iterator[slice]:
 
 
 def read_rows(path: Path, elements: dict[str, np.dtype]) -> dict[str, Rows]:
-    """The elements of a PLY by `write_ply`, of which nothing is read before their blocks are.
+    """Read the elements of a PLY by `write_ply`, of which nothing is read before their blocks are.
 
     `elements`: all of them in their order, a list as its length and its values. Raises InputError for a file that is
     missing or has others.
@@ -158,7 +158,7 @@ def _packed(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def columns(vertex: NDArray[Any], names: list[str], path: Path) -> NDArray[np.float32]:
-    """(rows, names) float32 of these properties, infinity as the largest number there is.
+    """Return (rows, names) float32 of these properties, infinity as the largest number there is.
 
     Raises InputError naming those that are missing or hold NaN.
     """
@@ -263,7 +263,7 @@ def _rows(cloud: GaussianCloud, rows: slice, dtype: np.dtype, occurring: list[in
 
 
 def read_gaussian_ply(path: Path) -> GaussianCloud:
-    """The Gaussians of a PLY by this or another program, of any spherical-harmonic degree.
+    """Read the Gaussians of a PLY by this or another program, of any spherical-harmonic degree.
 
     Raises InputError when the file is missing, damaged, a git-LFS pointer, or a PLY of another kind.
     """

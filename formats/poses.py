@@ -64,7 +64,7 @@ class PoseFile:
 
 
 def read_poses(path: Path) -> PoseFile:
-    """The poses of a file or folder, whatever it is of those named above. Raises InputError for anything else."""
+    """Read the poses of a file or folder, whatever it is of those named above. Raises InputError for anything else."""
     with reaching(path):
         path = home_expanded(path)
         if not path.exists():
@@ -87,7 +87,7 @@ def read_poses(path: Path) -> PoseFile:
 
 
 def stem(name: str) -> str:
-    """By which an image is known: its file's name without folder and suffix."""
+    """Return the name by which an image is known: its file's without folder and suffix."""
     return PurePosixPath(name.replace("\\", "/")).stem
 
 
@@ -168,8 +168,8 @@ def _unique(names: Iterable[str], path: Path) -> tuple[str, ...]:
 
 
 def phone_poses(path: Path) -> Found | None:
-    """The poses that an app left in a folder, or in one file of it; None where it is none of these layouts. Raises
-    InputError where it is one and damaged."""
+    """Return the poses that an app left in a folder, or in one file of it; None where it is none of these layouts.
+    Raises InputError where it is one and damaged."""
     if path.is_file():
         return _stray(path) if path.suffix.lower() == ".csv" else _record3d(path)
     for name in _POLYCAM:

@@ -23,8 +23,8 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 @contextmanager
 def reaching(path: Path) -> Iterator[None]:
-    """Around looking at a path, or into a folder: what the system refuses there becomes an InputError, which names the
-    path that the system names."""
+    """Turn what the system refuses in this block, which looks at a path or into a folder, into an InputError that names
+    the path which the system names."""
     try:
         yield
     except OSError as error:
@@ -41,13 +41,14 @@ def _unreachable(error: OSError, path: Path) -> InputError:
 
 
 def home_expanded(text: str | Path) -> Path:
-    """The path with `~` or `~user` at its beginning replaced; as it is where there is no such user."""
+    """Return the path with `~` or `~user` at its beginning replaced; as it is where there is no such user."""
     return Path(os.path.expanduser(text))
 
 
 @contextmanager
 def parsing(path: Path | str, what: str, advice: str = "copy or export it again") -> Iterator[None]:
-    """Around code that takes a file's bytes apart, a library's above all: what it raises is the file's fault.
+    """Turn what is raised in this block, in which a library takes a file's bytes apart, into an InputError about the
+    file.
 
     Libraries report damage under every name there is (of zlib, of their own unpacking, AssertionError, MemoryError);
     a list of them is never whole. So only that call is in the block. InputErrors pass as they are.
@@ -64,7 +65,7 @@ def parsing(path: Path | str, what: str, advice: str = "copy or export it again"
 
 @contextmanager
 def opened(path: Path, limit: int | None = None, *, any_content: bool = False) -> Iterator[BufferedReader]:
-    """A regular file, open for reading.
+    """Open a regular file for reading.
 
     Raises InputError when it is missing, may not be read, is larger than `limit` bytes, or no file at all (a pipe or a
     device would be waited for or read without an end), and unless `any_content` when it is empty or a git-LFS pointer.
@@ -113,7 +114,8 @@ def _require_content(path: Path, file: BufferedReader) -> None:
 
 
 def require_file(path: Path, limit: int | None = None) -> int:
-    """The size in bytes of a file that can be opened, for libraries that open it themselves. Raises as `opened`."""
+    """Return the size in bytes of a file that can be opened, for libraries that open it themselves. Raises as
+    `opened`."""
     with opened(path, limit) as file:
         return os.fstat(file.fileno()).st_size
 
@@ -125,7 +127,7 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
 
 
 def is_unicode(text: str) -> bool:
-    """Whether a text can be written as UTF-8: names on disk that are no UTF-8 come as lone surrogates."""
+    """Return whether a text can be written as UTF-8: names on disk that are no UTF-8 come as lone surrogates."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -148,7 +150,7 @@ def require_listable(paths: Iterable[Path]) -> None:
 
 
 def resolve_within(root: Path, relative: str, named_by: Path) -> Path:
-    """`root / relative`, where `named_by` is the file that says so.
+    """Return `root / relative`, where `named_by` is the file that says so.
 
     Raises InputError when the name leads out of `root`, by `..` or as an absolute path: data from others must not
     reach into the rest of the disk. Links are followed: whoever may make one in the folder has the disk already.
@@ -165,8 +167,8 @@ def resolve_within(root: Path, relative: str, named_by: Path) -> Path:
 
 
 def named_file(places: Sequence[Path], name: str, named_by: Path, shorten: bool = True) -> Path | None:
-    """The file in one of `places` with the path `name`, or its longest end that is there; None without even one of the
-    bare name.
+    """Return the file in one of `places` with the path `name`, or its longest end that is there; None without even one
+    of the bare name.
 
     For names written on another machine: absolute, with backslashes, or seen from another folder. What is returned
     lies in one of `places`, whatever the name. Without `shorten` only roots and leading `..` are left off. Raises

@@ -87,14 +87,14 @@ def _quaternion_bytes(quat_wxyz: Array) -> NDArray[np.uint8]:
 
 
 def morton_order(means: Array) -> NDArray[np.int64]:
-    """(M,) rows along a curve that leaves small cubes last; ties as they came."""
+    """Return (M,) rows along a curve that leaves small cubes last; ties as they came."""
     low, high = means.min(axis=0), means.max(axis=0)
     cells = ((means - low) / np.maximum(high - low, 1e-12) * ((1 << _MORTON_BITS) - 1)).astype(np.int64)
     return np.argsort(morton_codes(cells), kind="stable")
 
 
 def morton_codes(cells: NDArray[np.integer]) -> NDArray[np.int64]:
-    """(M,) the bits of the coordinates (M, 3), 0 to 2^21 - 1, in turn (Morton 1966)."""
+    """Return (M,) the bits of the coordinates (M, 3), 0 to 2^21 - 1, in turn (Morton 1966)."""
     cells, codes = cells.astype(np.int64), np.zeros(len(cells), np.int64)
     for bit in range(21):
         for axis in range(3):

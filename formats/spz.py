@@ -42,7 +42,8 @@ def write_spz(path: Path, cloud: GaussianCloud, version: int = 4) -> None:
 
 
 def spz_bytes(cloud: GaussianCloud, version: int) -> bytes:
-    """A cloud as SPZ version 4 (or 3 or 2, for older readers) without view-dependent colour; classes are not kept.
+    """Encode a cloud as SPZ version 4 (or 3 or 2, for older readers) without view-dependent colour; classes are not
+    kept.
 
     Positions are fixed point of 24 bits with as many fraction bits as the scene's extent leaves (at most 16), scales
     steps of 1/16 in the logarithm, opacity and colour 8 bits, rotations 10 bits a component (8 in version 2). The same
@@ -83,7 +84,7 @@ def _container_3(streams: list[bytes], count: int, fraction_bits: int, version: 
 
 
 def read_spz(path: Path) -> GaussianCloud:
-    """The Gaussians of an SPZ file of version 2, 3 or 4; view-dependent colour is dropped.
+    """Read the Gaussians of an SPZ file of version 2, 3 or 4; view-dependent colour is dropped.
 
     Raises InputError for another version, for a damaged file, and for one that would unpack to far more than it is.
     """
@@ -93,7 +94,8 @@ def read_spz(path: Path) -> GaussianCloud:
 
 
 def read_spz_stream(plain: BinaryIO, size: int, path: Path) -> GaussianCloud:
-    """`read_spz` of `size` bytes that lie open; `path` is for messages. Damage raises whatever comes of it too."""
+    """Read as `read_spz` does `size` bytes that lie open; `path` is for messages. Damage raises whatever comes of it
+    too."""
     limit = max(_MIN_LIMIT, size * _MAX_RATIO)
     is_plain = plain.read(4) == _MAGIC
     plain.seek(0)

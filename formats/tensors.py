@@ -54,7 +54,7 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray], *, compress: bool = T
 
 
 def load_arrays(path: Path, *, own: bool = False) -> dict[str, NDArray]:
-    """The arrays of an .npz file; `own`: one of a run, which a checksum says that this program has written.
+    """Return the arrays of an .npz file; `own`: one of a run, which a checksum says that this program has written.
 
     Raises InputError when it is missing, damaged, or holds objects; a foreign one too when it unpacks to more than
     `MAX_UNPACKED_BYTES`: what was written of a long recording has to be read again, however large.
@@ -94,8 +94,8 @@ def save_tensors(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
 
 
 def load_tensors(path: Path) -> dict[str, torch.Tensor]:
-    """All tensors of a run's .safetensors file, of any size, on the CPU. Raises InputError when it is missing
-    or damaged."""
+    """Return all tensors of a run's .safetensors file, of any size, on the CPU. Raises InputError when it is missing or
+    damaged."""
     import safetensors.torch
 
     require_file(path)

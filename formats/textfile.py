@@ -32,7 +32,7 @@ _COMMENT = re.compile(r"^\s*//|(?:^|\s)#")
 
 
 def read_text(path: Path, limit: int | None = MAX_TEXT_BYTES) -> str:
-    """The text of a UTF-8 file, or one of UTF-16 that begins with its mark, as PowerShell writes.
+    """Read the text of a UTF-8 file, or one of UTF-16 that begins with its mark, as PowerShell writes.
 
     Raises InputError when it is missing, binary, or larger than `limit` bytes.
     """
@@ -45,7 +45,8 @@ def read_text(path: Path, limit: int | None = MAX_TEXT_BYTES) -> str:
 
 
 def read_rows(path: Path) -> list[list[str]]:
-    """The fields of each line, split at blanks and commas; empty lines, comments and a line of headings are left out.
+    """Read the fields of each line, split at blanks and commas; empty lines, comments and a line of headings are left
+    out.
 
     A comment begins with # or // at the start of a line, or with # after a blank; headings are a first line without
     a number.
@@ -64,7 +65,7 @@ def _is_number(field: str) -> bool:
 
 
 def read_table(path: Path, columns: int | None = None) -> NDArray[np.float64]:
-    """(rows, columns) float64 of a text table; with `columns` None, as many as the first row has.
+    """Read (rows, columns) float64 of a text table; with `columns` None, as many as the first row has.
 
     Raises InputError that names the first row of another length or with a field that is no number.
     """
@@ -105,7 +106,7 @@ def read_json(path: Path, limit: int | None = MAX_JSON_BYTES, *, allow_nan: bool
 
 
 def read_json_object(path: Path, limit: int | None = MAX_JSON_BYTES, *, allow_nan: bool = False) -> dict[str, Any]:
-    """The object in a JSON file. Raises InputError as `read_json`, and when it holds something else."""
+    """Read the object in a JSON file. Raises InputError as `read_json`, and when it holds something else."""
     value = read_json(path, limit, allow_nan=allow_nan)
     if not isinstance(value, dict):
         raise InputError(f"{path} holds a {type(value).__name__}, expected an object in braces")
@@ -113,7 +114,7 @@ def read_json_object(path: Path, limit: int | None = MAX_JSON_BYTES, *, allow_na
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The table in a TOML file. Raises InputError when it is missing, too large, damaged or nested too deep."""
+    """Read the table in a TOML file. Raises InputError when it is missing, too large, damaged or nested too deep."""
     text = read_text(path, MAX_TOML_BYTES)
     with parsing(path, "valid TOML", "correct it"):
         if any(part.count(".") > _DEEPEST_KEY for part in _KEY_ENDS.split(_NO_KEY.sub("", text))):
@@ -139,7 +140,8 @@ def _integer(digits: str) -> int:
 
 
 def number(table: dict[str, Any], path: Path, *names: str) -> float:
-    """The number under the first of these names that is there. Raises InputError when none is, or it is no number."""
+    """Return the number under the first of these names that is there. Raises InputError when none is, or it is no
+    number."""
     value = optional_number(table, path, *names)
     if value is None:
         raise InputError(f"{path} lacks {' or '.join(repr(n) for n in names)}: add it")

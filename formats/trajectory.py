@@ -25,7 +25,7 @@ FARTHEST = 1e9
 
 
 def nearest_rotation(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotations (..., 3, 3) closest to the given matrices in the Frobenius norm (orthogonal Procrustes).
+    """Find the rotations (..., 3, 3) closest to the given matrices in the Frobenius norm (orthogonal Procrustes).
 
     Raises ValueError where a matrix is singular or not finite.
     """
@@ -61,7 +61,7 @@ def write_tum(path: Path, timestamps: NDArray[np.float64], world_from_cam: NDArr
 def poses_from_quaternions(
     quat_xyzw: NDArray[np.float64], translations: NDArray[np.float64], name: str
 ) -> NDArray[np.float64]:
-    """(N, 4, 4) rigid transforms of quaternions (N, 4) and translations (N, 3) as the file `name` has them.
+    """Return (N, 4, 4) rigid transforms of quaternions (N, 4) and translations (N, 3) as the file `name` has them.
 
     A pose that is not finite, or whose quaternion is all zeros, as lost tracking is written, becomes all NaN. Raises
     InputError where a quaternion is so far from length 1 that it is none.
@@ -92,7 +92,7 @@ def _is_within_reach(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(N,) timestamps in file order and (N, 4, 4) world_from_cam of a TUM file, without rows that are not finite.
+    """Read (N,) timestamps in file order and (N, 4, 4) world_from_cam of a TUM file, without rows that are not finite.
 
     Raises InputError for a row of other than 8 numbers, a pose that is none, or where most rows are not finite.
     """
@@ -109,7 +109,8 @@ def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def read_matrices(path: Path) -> NDArray[np.float64]:
-    """(N, 4, 4) world_from_cam of a file of row-major matrices: 16 or 12 numbers a line, or 4 lines for each matrix.
+    """Read (N, 4, 4) world_from_cam of a file of row-major matrices: 16 or 12 numbers a line, or 4 lines for each
+    matrix.
 
     Rotations are projected to the nearest true ones. A matrix that is not finite (a frame without a pose, as ScanNet
     writes it) comes back all NaN. Raises InputError for anything else that is no rigid transform.
@@ -129,7 +130,7 @@ def read_matrices(path: Path) -> NDArray[np.float64]:
 
 
 def clean_poses(matrices: NDArray[np.float64], name: str) -> NDArray[np.float64]:
-    """Rigid transforms (N, 4, 4) with exact rotations; matrices that are not finite become all NaN.
+    """Return the rigid transforms (N, 4, 4) with exact rotations; matrices that are not finite become all NaN.
 
     Raises InputError, with `name` for the file, where the rotation part is no rotation within a few percent, so that
     a scaled, mirrored or transposed-with-translation matrix is not taken for a pose.

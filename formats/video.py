@@ -221,7 +221,7 @@ class _Clock:
         self._start = 0.0
 
     def next(self, stored: float) -> float:
-        """The time of the next frame, given what the container says (any float, NaN and negative included)."""
+        """Return the time of the next frame, given what the container says (any float, NaN and negative included)."""
         if not self.times:
             self._start = stored if math.isfinite(stored) else 0.0
             time = 0.0
@@ -377,14 +377,14 @@ class Display:
         return self.swaps or self.mirror != (1, 1)
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height in which a decoded frame of that size is shown; none becomes less."""
+        """Return the width and height in which a decoded frame of that size is shown; none becomes less."""
         width, height = (height, width) if self.swaps else (width, height)
         if self.aspect >= 1:
             return round(width * self.aspect), height
         return width, round(height / self.aspect)
 
     def shown(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W, ...) in the size that `size` says."""
+        """Return (H, W, ...) in the size that `size` says."""
         size = self.size(image.shape[1], image.shape[0])
         image = np.swapaxes(image, 0, 1) if self.swaps else image
         image = np.ascontiguousarray(image[:: self.mirror[1], :: self.mirror[0]])
@@ -394,7 +394,7 @@ class Display:
 
 
 def read_mirror(path: Path) -> Display:
-    """The Display of an MP4 or MOV whose track header (ISO/IEC 14496-12, 8.3.2) mirrors the picture; for all other
+    """Read the Display of an MP4 or MOV whose track header (ISO/IEC 14496-12, 8.3.2) mirrors the picture; for all other
     files, and where it only turns, which decoders do, one that leaves all as it is."""
     for track in read_moov(path).split(b"trak")[1:]:
         head = track.find(b"tkhd")
@@ -413,7 +413,8 @@ def read_mirror(path: Path) -> Display:
 
 
 def pixel_aspect(wide: float, high: float) -> float:
-    """Width by height of a pixel; 1 where it is not said (0), damaged, or only rounding away from a square."""
+    """Return the width by height of a pixel; 1 where it is not said (0), damaged, or only rounding away from a
+    square."""
     aspect = wide / high if wide > 0 and high > 0 else 1.0
     is_square = abs(aspect - 1) < _SQUARE or not 1 / _LONGEST_PIXEL <= aspect <= _LONGEST_PIXEL
     return 1.0 if is_square else aspect

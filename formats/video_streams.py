@@ -63,7 +63,7 @@ _FINE = 1 << 14
 
 
 def hdr_transfer(path: Path) -> str:
-    """ "HLG" or "PQ" where an MP4 or MOV says so in its colr box; "" for all else."""
+    """Return "HLG" or "PQ" where an MP4 or MOV says so in its colr box; "" for all else."""
     moov = read_moov(path)
     place = moov.find(b"colrnclx")
     return _TRANSFERS.get(int.from_bytes(moov[place + 10 : place + 12], "big"), "") if place >= 0 else ""
@@ -92,11 +92,11 @@ class AvCapture:
         self._frames = _decoded(self._container, self._stream, interlaced)
 
     def isOpened(self) -> bool:
-        """Whether there is a video stream."""
+        """Return whether there is a video stream."""
         return self._stream is not None
 
     def get(self, what: int) -> float:
-        """The properties that are asked for, of the frame grabbed last; 0 for others."""
+        """Return the properties that are asked for, of the frame grabbed last; 0 for others."""
         frame, stream = self._frame, self._stream
         turn = frame.rotation % 360
         size = (frame.height, frame.width) if self._turns and turn % 180 else (frame.width, frame.height)
@@ -126,7 +126,7 @@ class AvCapture:
         return following is not None
 
     def retrieve(self) -> tuple[bool, NDArray[np.uint8]]:
-        """The frame as OpenCV would give it: (H, W, 3) uint8 BGR, upright."""
+        """Return the frame as OpenCV would give it: (H, W, 3) uint8 BGR, upright."""
         frame = self._frame
         if self._transfer:
             bgr = tone_mapped(frame.to_ndarray(format="rgb48le"), self._transfer)[..., ::-1]
@@ -191,7 +191,7 @@ def _through(graph: Any, frames: list[Any]) -> Iterator[Any]:
 
 
 def tone_mapped(rgb: NDArray[np.uint16], transfer: str) -> NDArray[np.uint8]:
-    """(H, W, 3) sRGB of BT.2020 images with that transfer function, full range.
+    """Convert to (H, W, 3) sRGB BT.2020 images with that transfer function, full range.
 
     Diffuse white (ITU-R BT.2408: 203 cd/m2 in PQ, 75 % in HLG, whose light is taken as the scene's) stays near white;
     above `_KNEE` the largest channel bends towards 1 and takes the others along, so that hues stay.
@@ -226,7 +226,7 @@ def _srgb() -> NDArray[np.uint8]:
 
 
 def read_moov(path: Path) -> bytes:
-    """The head of an MP4 or MOV, at most 64 MB of it; nothing for any other file, or where a length is damaged."""
+    """Read the head of an MP4 or MOV, at most 64 MB of it; nothing for any other file, or where a length is damaged."""
     end = path.stat().st_size
     with open(path, "rb") as file:
         for _ in range(_MAX_BOXES):
@@ -246,7 +246,7 @@ def read_moov(path: Path) -> bytes:
 
 
 def video_sphere(path: Path) -> str:
-    """WHOLE, PART (one eye of two, half a sphere, a cube map) or "" for what says nothing of the kind.
+    """Return WHOLE, PART (one eye of two, half a sphere, a cube map) or "" for what says nothing of the kind.
 
     By the boxes of the Spherical Video RFC (github.com/google/spatial-media): its second version's `st3d` and `sv3d`,
     or the XML of its first.
@@ -276,7 +276,7 @@ def image_sphere(path: Path) -> str:
 
 
 def has_pyav() -> bool:
-    """Whether PyAV is there (the extra "hdr")."""
+    """Return whether PyAV is there (the extra "hdr")."""
     try:
         import av  # noqa: F401
     except ImportError:
@@ -285,7 +285,8 @@ def has_pyav() -> bool:
 
 
 def is_interlaced(path: Path, frames: int) -> bool:
-    """Whether FFmpeg takes the stream, or one of its first `frames`, for interlaced; False for what it cannot read."""
+    """Return whether FFmpeg takes the stream, or one of its first `frames`, for interlaced; False for what it cannot
+    read."""
     return _by_pyav(path, frames) if has_pyav() else _by_listening(path, frames)
 
 
@@ -337,5 +338,5 @@ def unreadable(path: Path, codec: str, first: int = 0) -> InputError:
 
 
 def as_opencv_writes_them() -> str:
-    """OPEN_OPTIONS as the variable OPENCV_FFMPEG_CAPTURE_OPTIONS has them."""
+    """Return OPEN_OPTIONS as the variable OPENCV_FFMPEG_CAPTURE_OPTIONS has them."""
     return "|".join(f"{name};{value}" for name, value in OPEN_OPTIONS.items())

@@ -98,7 +98,7 @@ def write_browser_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: fl
 
 
 def best_codec(folder: Path) -> str:
-    """The first of H.264, VP9 and MPEG-4 part 2 that can be written here; tried in `folder`."""
+    """Return the first of H.264, VP9 and MPEG-4 part 2 that can be written here; tried in `folder`."""
     if _has_x264():
         return H264
     folder.mkdir(parents=True, exist_ok=True)

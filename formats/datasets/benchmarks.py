@@ -43,7 +43,7 @@ _SEVEN_SCENES_NOTES = (
 
 
 def recognises_seven_scenes(path: Path) -> bool:
-    """frame-000000.color.png and the like."""
+    """Recognise frame-000000.color.png and the like."""
     return any(path.glob("frame-*.color.*"))
 
 
@@ -90,12 +90,12 @@ def _seven_scenes_camera(path: Path, size: tuple[int, int], focal: float) -> Cam
 
 
 def recognises_tum(path: Path) -> bool:
-    """A folder with rgb.txt and the images it lists."""
+    """Recognise a folder with rgb.txt and the images it lists."""
     return (path / "rgb.txt").is_file() and (path / "rgb").is_dir()
 
 
 def open_tum_rgbd(path: Path) -> Sequence:
-    """A TUM RGB-D sequence: metric poses of the colour camera, depth registered to colour.
+    """Open a TUM RGB-D sequence: metric poses of the colour camera, depth registered to colour.
 
     Images, depth and poses are joined by the nearest time within 20 ms. The calibration is intrinsics.json where
     there is one, else that of the freiburg camera in the folder's name, else 525. Raises InputError for lists that
@@ -141,12 +141,12 @@ def _tum_camera(path: Path, image: Path) -> tuple[Camera | None, tuple[str, ...]
 
 
 def recognises_euroc(path: Path) -> bool:
-    """A folder with mav0/cam0/data.csv, or mav0 itself."""
+    """Recognise a folder with mav0/cam0/data.csv, or mav0 itself."""
     return any((root / "cam0" / "data.csv").is_file() for root in (path / "mav0", path))
 
 
 def open_euroc(path: Path) -> Sequence:
-    """The left camera of a EuRoC sequence: metric poses, grey images with lens distortion, no depth.
+    """Open the left camera of a EuRoC sequence: metric poses, grey images with lens distortion, no depth.
 
     Poses are those of the body, moved to the camera by the extrinsics in sensor.yaml. Raises InputError where a table
     or the calibration cannot be read.

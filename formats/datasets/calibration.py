@@ -35,7 +35,7 @@ _MAX_DEPTH, _MAX_BYTES, _MAX_CAMERAS = 8, 2_000_000, 1000
 
 
 def read_calibration_file(path: Path, size: tuple[int, int]) -> dict[str, Camera]:
-    """The cameras of a file by their names there; of `size` (width, height) where it states none.
+    """Read the cameras of a file by their names there; of `size` (width, height) where it states none.
 
     Raises InputError for a file without any, a lens that is not supported, and coefficients that would be lost.
     """
@@ -193,7 +193,7 @@ def _numbers(value: Any) -> list[float] | None:
 
 
 def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, float | None]:
-    """The camera, and raw depth units per metre where the file says so.
+    """Read the camera, and raw depth units per metre where the file says so.
 
     Understands w/width, h/height, fx, fy, cx, cy, distortion (a list, or k1, k2, p1, p2, k3) and depth_scale/scale,
     at the top or under "camera"; beside a model or camera_model with FISHEYE in its name, k1 to k4 are the fisheye's. A
@@ -210,7 +210,8 @@ def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, 
 
 
 def camera_from_table(table: dict[str, Any], path: Path, *, integer_centres: bool) -> Camera:
-    """The camera in a table of the keys that `read_intrinsics_json` understands. Raises InputError as that does."""
+    """Return the camera in a table of the keys that `read_intrinsics_json` understands. Raises InputError as that
+    does."""
     said = str(table.get("pixel_centre", "integer" if integer_centres else "half")).lower()
     if not said.startswith(("integer", "half")):
         raise InputError(f"{path}: pixel_centre is {said!r}, expected it to begin with 'integer' or 'half'")
@@ -241,8 +242,8 @@ def _distortion(table: dict, path: Path, names: tuple[str, ...]) -> tuple[float,
 
 
 def coefficients(values: list[float], names: tuple[str, ...]) -> tuple[float, ...] | None:
-    """Distortion coefficients of a list in OpenCV's order, as `Camera` has them; None for a list of another length, or
-    with thin prism or tilt coefficients (the 9th to 14th) that are not zero."""
+    """Return the distortion coefficients of a list in OpenCV's order, as `Camera` has them; None for a list of another
+    length, or with thin prism or tilt coefficients (the 9th to 14th) that are not zero."""
     if any(values[len(names) :]) or len(values) not in (*range(1, min(len(names), 5) + 1), 8, 12, 14):
         return None
     found = tuple(float(v) for v in values[: len(names)])

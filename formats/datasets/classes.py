@@ -17,7 +17,8 @@ _VOID_NAMES = frozenset({"none", "void", "undefined", "unlabeled", "unlabelled",
 
 
 def read_classes_json(path: Path) -> tuple[LabelClass, ...]:
-    """Classes of `{"classes": [{"id": 3, "name": "sofa", "color": [r, g, b]}, ...]}` by id, without the void ones.
+    """Read the classes of `{"classes": [{"id": 3, "name": "sofa", "color": [r, g, b]}, ...]}` by id, without the void
+    ones.
 
     The colour may be missing. Void is what is named so (none, void, undefined, unlabeled, unknown, ignore).
     Raises InputError for another shape, an id outside 0..65535, or an id that occurs twice.
@@ -49,7 +50,7 @@ def find_label_table(path: Path) -> Path | None:
 
 
 def read_nyu40_classes(path: Path) -> tuple[LabelClass, ...]:
-    """The NYU40 classes, each with the raw ids that belong to it. Raises InputError for another table."""
+    """Read the NYU40 classes, each with the raw ids that belong to it. Raises InputError for another table."""
     members: dict[tuple[int, str], list[int]] = {}
     rows = csv.DictReader(read_text(path).splitlines(), delimiter="\t")
     try:

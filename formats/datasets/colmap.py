@@ -18,12 +18,12 @@ _LEVELS_UP = 3
 
 
 def recognises(path: Path) -> bool:
-    """A folder with a complete model, as text or binary, with its images in reach."""
+    """Recognise a folder with a complete model, as text or binary, with its images in reach."""
     return _find_model(path) is not None
 
 
 def open_colmap(path: Path) -> Sequence:
-    """The registered images of a COLMAP model in natural order; lengths are in the model's own unit.
+    """Open the registered images of a COLMAP model in natural order; lengths are in the model's own unit.
 
     The camera is given when all images share one; its distortion as OpenCV has it. Raises InputError when the model
     is incomplete or damaged, or its images are not found in images/, frames/ or rgb/ in the folder or above it.
@@ -97,7 +97,8 @@ def _shared_camera(model: ColmapModel) -> tuple[Camera | None, tuple[str, ...]]:
 def camera_from_colmap(
     name: str, width: int, height: int, p: tuple[float, ...]
 ) -> tuple[Camera | None, tuple[str, ...]]:
-    """The camera of a COLMAP model name with its parameters; None and a note where it has no OpenCV equivalent."""
+    """Return the camera of a COLMAP model name with its parameters; None and a note where it has no OpenCV
+    equivalent."""
     focal = (p[0], p[0]) if name.startswith(("SIMPLE_", "RADIAL")) else (p[0], p[1])
     rest = p[1:] if name.startswith(("SIMPLE_", "RADIAL")) else p[2:]
     k = rest[2:]

@@ -30,12 +30,12 @@ _INTRINSICS_FILES = ("intrinsics.json", "cam_params.json", "camera.json")
 
 
 def recognises(path: Path) -> bool:
-    """A folder of images, or one with a folder rgb/, images/, color/ or frames/."""
+    """Recognise a folder of images, or one with a folder rgb/, images/, color/ or frames/."""
     return image_folder(path) is not None
 
 
 def open_folder(path: Path) -> Sequence:
-    """A plain folder: only the images must be there.
+    """Open a plain folder: only the images must be there.
 
     Beside or above them may be depth/ (16 bit PNG, millimetres unless depth_scale in the intrinsics says otherwise),
     labels/ (8 or 16 bit PNG of class ids) with classes.json, intrinsics.json (fx, fy, cx, cy, width, height,
@@ -70,7 +70,8 @@ def open_folder(path: Path) -> Sequence:
 
 
 def image_folder(path: Path) -> Path | None:
-    """The folder that holds most images: this one, or the rgb/, images/, color/ or frames/ in it. None without any.
+    """Return the folder that holds most images: this one, or the rgb/, images/, color/ or frames/ in it. None without
+    any.
 
     A picture or two beside images/ are thumbnails or plots; the other way round images/ is something else's.
     """

@@ -45,7 +45,8 @@ def read_timed_files(
 
 
 def files_for_images(images: list[Path], folder: Path, pattern: str = "*") -> tuple[Path | None, ...]:
-    """For each image the file in `folder` of the same name, else of the same frame number; () without such a folder.
+    """Find for each image the file in `folder` of the same name, else of the same frame number; () without such a
+    folder.
 
     Raises InputError when the folder has files and none of them belongs to an image.
     """
@@ -66,7 +67,7 @@ def files_for_images(images: list[Path], folder: Path, pattern: str = "*") -> tu
 
 
 def poses_for_images(images: list[Path], poses: NDArray[np.float64], source: Path) -> NDArray[np.float64]:
-    """(N, 4, 4) the rows of `poses` that belong to the images: one each, else the row of each frame number.
+    """Return (N, 4, 4) the rows of `poses` that belong to the images: one each, else the row of each frame number.
 
     Raises InputError when neither fits.
     """
@@ -88,7 +89,8 @@ def poses_at(
     world_from_cam: NDArray[np.float64],
     tolerance: float = SAME_INSTANT_SECONDS,
 ) -> NDArray[np.float64]:
-    """(N, 4, 4) for each of `times` the known pose nearest in time, NaN where none is within `tolerance` seconds."""
+    """Return (N, 4, 4) for each of `times` the known pose nearest in time, NaN where none is within `tolerance`
+    seconds."""
     known = np.isfinite(pose_times) & np.isfinite(world_from_cam).all(axis=(1, 2))
     if not known.any():
         return np.full((len(times), 4, 4), np.nan)
@@ -101,7 +103,7 @@ def poses_at(
 
 
 def nearest_index(sorted_times: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.int64]:
-    """(N,) for each of `times` the index of the nearest of `sorted_times`, the earlier of two equally near."""
+    """Find (N,) for each of `times` the index of the nearest of `sorted_times`, the earlier of two equally near."""
     after = np.searchsorted(sorted_times, times).clip(0, len(sorted_times) - 1)
     before = (after - 1).clip(0)
     closer = np.abs(sorted_times[before] - times) <= np.abs(sorted_times[after] - times)
@@ -109,8 +111,8 @@ def nearest_index(sorted_times: NDArray[np.float64], times: NDArray[np.float64])
 
 
 def times_or_frame_numbers(images: list[Path]) -> tuple[NDArray[np.float64], bool]:
-    """(N,) seconds: the images' own times, else their frame numbers (else their order) over `ASSUMED_RATE`; and whether
-    they are the images' own."""
+    """Return (N,) seconds: the images' own times, else their frame numbers (else their order) over `ASSUMED_RATE`; and
+    whether they are the images' own."""
     times = read_image_times(images)
     if times is not None:
         return times, True
@@ -121,7 +123,7 @@ def times_or_frame_numbers(images: list[Path]) -> tuple[NDArray[np.float64], boo
 
 
 def classes_found(paths: tuple[Path | None, ...]) -> tuple[LabelClass, ...]:
-    """A class for every id that occurs in the label images, named by its number: for sets that name none.
+    """Return a class for every id that occurs in the label images, named by its number: for sets that name none.
 
     Of long sequences some `_MAX_IMAGES_SEARCHED` evenly spread images are looked at.
     """

@@ -34,12 +34,12 @@ _SAME_COEFFICIENT = 0.01
 
 
 def recognises(path: Path) -> bool:
-    """A folder with transforms.json, or that file itself."""
+    """Recognise a folder with transforms.json, or that file itself."""
     return _file(path) is not None
 
 
 def open_nerfstudio(path: Path) -> Sequence:
-    """The frames of a transforms.json in natural order of their names; missing images are left out and counted.
+    """Open the frames of a transforms.json in natural order of their names; missing images are left out and counted.
 
     Poses are turned from OpenGL's camera axes to x right, y down, z forward. Depth (depth_file_path) is in
     millimetres, as nerfstudio takes it, and then the poses are metric; without it they may have any scale. Raises

@@ -47,14 +47,14 @@ FORMATS = ("auto", *_READERS)
 
 
 def recognise(path: Path) -> str | None:
-    """The format of a data set by its files, "folder" for plain images, None for anything else."""
+    """Return the format of a data set by its files, "folder" for plain images, None for anything else."""
     with reaching(path):
         found = _recognise(Path(path))
     return found[0] if found else None
 
 
 def recognise_source(path: Path) -> str | None:
-    """The format of a recording to reconstruct; None for a video, and for a folder that holds images directly.
+    """Return the format of a recording to reconstruct; None for a video, and for a folder that holds images directly.
 
     Other than `recognise`, it takes what a user points at literally: a folder of images is no data set because of what
     is above it, nor because somebody has left a COLMAP model in it; but a few pictures beside images/ are no source.
@@ -67,7 +67,8 @@ def recognise_source(path: Path) -> str | None:
 
 
 def looks_like_recording(path: Path) -> bool:
-    """Whether a folder holds images, or a data set, or what is left of one: opening it may still fail, with the reason.
+    """Return whether a folder holds images, or a data set, or what is left of one: opening it may still fail, with the
+    reason.
 
     Raises InputError where the folder may not be read.
     """

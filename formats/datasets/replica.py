@@ -25,12 +25,12 @@ _CLASS_FOLDERS = ("semantic_class", "semantic_classes")
 
 
 def recognises(path: Path) -> bool:
-    """results/frame*.jpg with traj.txt (NICE-SLAM), or rgb/ with semantic_class/ (Semantic-NeRF, vMAP)."""
+    """Recognise results/frame*.jpg with traj.txt (NICE-SLAM), or rgb/ with semantic_class/ (Semantic-NeRF, vMAP)."""
     return _is_nice_slam(path) or any(_is_rendered(p) for p in _candidates(path))
 
 
 def open_replica(path: Path) -> Sequence:
-    """A Replica sequence; depth and poses are metric, class 0 is void.
+    """Open a Replica sequence; depth and poses are metric, class 0 is void.
 
     Without cam_params.json the renders have a horizontal field of view of 90 degrees in all layouts. Raises InputError
     where the parts do not fit together.

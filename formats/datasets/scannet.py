@@ -33,12 +33,12 @@ _COLOR_SIZE, _DEPTH_SIZE = (1296, 968), (640, 480)
 
 
 def recognises(path: Path) -> bool:
-    """color/ and pose/ with one text file a frame."""
+    """Recognise color/ and pose/ with one text file a frame."""
     return (path / "color").is_dir() and (path / "pose").is_dir() and any((path / "pose").glob("*.txt"))
 
 
 def open_scannet(path: Path) -> Sequence:
-    """An exported ScanNet scene: metric poses, of which lost frames have none, depth of its own camera.
+    """Open an exported ScanNet scene: metric poses, of which lost frames have none, depth of its own camera.
 
     Labels are joined to the NYU40 classes where scannetv2-labels.combined.tsv is in the folder or above it, else
     each raw id is a class of its own. Raises InputError where a part cannot be read.
@@ -77,7 +77,7 @@ def _camera(path: Path, image: Path | None, recorded_size: tuple[int, int]) -> C
 
 
 def scaled_camera(k: NDArray[np.float64], recorded: tuple[int, int], actual: tuple[int, int]) -> Camera:
-    """The camera with calibration matrix k (first pixel at (0, 0)) for images of the actual size.
+    """Return the camera with calibration matrix k (first pixel at (0, 0)) for images of the actual size.
 
     Images are often passed on smaller than recorded, with the calibration as it was: then the principal point is
     far from the middle, and the matrix is taken to be that of the recorded size.
@@ -96,7 +96,7 @@ def _classes(path: Path, label_paths: tuple[Path | None, ...]) -> tuple[LabelCla
 
 
 def recognises_sens(path: Path) -> bool:
-    """A file named .sens."""
+    """Recognise a file named .sens."""
     return path.is_file() and path.suffix.lower() == ".sens"
 
 
@@ -123,12 +123,12 @@ class SensFrames:
     depth_bytes: NDArray[np.int64]
 
     def rgb(self, index: int) -> NDArray[np.uint8]:
-        """(H, W, 3) uint8. Raises InputError for a damaged frame."""
+        """Return (H, W, 3) uint8. Raises InputError for a damaged frame."""
         data = self._read(int(self.starts[index]), int(self.color_bytes[index]))
         return decode_rgb(data, f"frame {index} of {self.path}")
 
     def raw_depth(self, index: int) -> NDArray[np.uint16]:
-        """(h, w) uint16. Raises InputError for a damaged frame."""
+        """Return (h, w) uint16. Raises InputError for a damaged frame."""
         width, height = self.depth_size
         start = int(self.starts[index] + self.color_bytes[index])
         data = self._read(start, int(self.depth_bytes[index]))
@@ -149,7 +149,7 @@ class SensFrames:
 
 
 def open_sens(path: Path) -> Sequence:
-    """A .sens recording: metric poses, of which lost frames have none, depth of its own camera, no labels.
+    """Open a .sens recording: metric poses, of which lost frames have none, depth of its own camera, no labels.
 
     Raises InputError for another version or compression, and for a file that ends before its frames do.
     """

@@ -41,10 +41,10 @@ class FrameStore(Protocol):
     """Frames stored in one container file instead of a folder."""
 
     def rgb(self, index: int) -> NDArray[np.uint8]:
-        """(H, W, 3) uint8."""
+        """Return (H, W, 3) uint8."""
 
     def raw_depth(self, index: int) -> NDArray[np.uint16]:
-        """(H, W) uint16 in the container's unit."""
+        """Return (H, W) uint16 in the container's unit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,11 +128,12 @@ class Sequence:
         return np.asarray(np.isfinite(self.world_from_cam).all(axis=(1, 2)))
 
     def rgb(self, index: int) -> NDArray[np.uint8]:
-        """(H, W, 3) uint8. Raises InputError for an unreadable image."""
+        """Return (H, W, 3) uint8. Raises InputError for an unreadable image."""
         return self.store.rgb(index) if self.store else read_rgb(self.image_paths[index])
 
     def depth(self, index: int) -> NDArray[np.float32] | None:
-        """(h, w) float32 z-depth in metres with the field of view of the colour image, 0 = unknown; None without.
+        """Return (h, w) float32 z-depth in metres with the field of view of the colour image, 0 = unknown; None
+        without.
 
         Depth of another camera is moved to the colour camera's pixels; the few centimetres between the two lenses
         are left out, as these data sets do not state them.
@@ -147,7 +148,8 @@ class Sequence:
         return warp_nearest(depth, self.depth_camera, self.camera)
 
     def labels(self, index: int) -> NDArray[np.uint8] | None:
-        """(h, w) uint8 indices into `classes`, VOID_LABEL where the pixel has none of them; None without labels."""
+        """Return (h, w) uint8 indices into `classes`, VOID_LABEL where the pixel has none of them; None without
+        labels."""
         path = self.label_paths[index] if self.label_paths else None
         if path is None:
             return None
@@ -164,7 +166,7 @@ class Sequence:
 
 
 def used_label_ids(paths: Iterable[Path]) -> set[int]:
-    """All ids that occur in these label images."""
+    """Return all ids that occur in these label images."""
     seen = np.zeros(65536, dtype=bool)
     for path in paths:
         seen[read_label_png(path).ravel()] = True
@@ -244,7 +246,7 @@ class Camera:
 
 
 def warp_nearest(image: NDArray[np.float32], source: Camera, target: Camera) -> NDArray[np.float32]:
-    """(H, W) `image` of the source camera as the target camera sees it from the same place, 0 outside.
+    """Return (H, W) `image` of the source camera as the target camera sees it from the same place, 0 outside.
 
     Both cameras look the same way and their lens distortion is left out; the nearest pixel is taken, because the mean
     of two depths lies on neither surface. The source camera is scaled to the image's size first.
