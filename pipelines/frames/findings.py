@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ from ...formats.colmap import pose_of
 from ..engine.stages import StageContext
 from ..geometry.sparse_model import SparseModel
 from ..run.extension import ParentRun
+from ..sfm.adjust import focals_of_halves
 from ..sfm.candidates import GIVEN, GIVEN_ALONE
 from ..sfm.driver import Structure
 from ..sfm.given import agreement
@@ -19,6 +21,10 @@ from ..system.wording import stretches
 from ..types import Frame, GivenPoses
 
 _LEAST_PART = 3
+_APART, _ZOOM, _OFF = 5.0, 0.03, 0.05
+"""Standard deviations by which two focal lengths contradict each other, if they are also so far apart relatively: those
+of two halves of a recording, and one found beside one known before. Halves of five recordings without zoom: up to 3.2.
+"""
 
 
 def settled_origin(context: StageContext, origin: str, camera: pycolmap.Camera, structure: Structure) -> str:
@@ -34,6 +40,40 @@ def settled_origin(context: StageContext, origin: str, camera: pycolmap.Camera, 
         "camera in any case give it with --intrinsics"
     )
     return "self-calibrated"
+
+
+def warn_of_focal(
+    context: StageContext, origin: str, camera: pycolmap.Camera, structure: Structure, straight: pycolmap.Reconstruction
+) -> str:
+    """Warn of a focal length that changes or that the images contradict; return the camera's final origin, of which
+    EXIF is none whose focal length the adjustment has left far behind.
+
+    `camera` is the prior; `straight` the structure's model with what it would observe without a rolling shutter.
+    """
+    if structure.mapper == GIVEN_ALONE:
+        return origin
+    known, found = camera.mean_focal_length(), structure.model.cameras[1].mean_focal_length()
+    halves = focals_of_halves(straight)
+    (first, first_sd), (last, last_sd) = halves[0], halves[-1]
+    deviations = abs(last - first) / math.hypot(first_sd, last_sd)
+    if deviations > _APART and abs(last - first) > _ZOOM * first:
+        context.warn(
+            f"the focal length seems to change: halves of the recording disagree, {first:.0f} px against {last:.0f} px "
+            f"by {deviations:.0f} standard deviations. Record without zoom, or split the recording where it zooms"
+        )
+    elif origin == "given" and all(abs(f - known) > max(_APART * sd, _OFF * known) for f, sd in halves):
+        context.warn(
+            f"the camera of --intrinsics (focal length {known:.0f} px) contradicts the images, which say {first:.0f} ± "
+            f"{first_sd:.0f} px; it is held as you gave it. Check its numbers and the image size they are of, or omit "
+            "--intrinsics"
+        )
+    if origin == "exif" and abs(found - known) > max(_APART * structure.focal_sd, _OFF * known):
+        context.warn(
+            f"the focal length that EXIF states ({known:.0f} px) is far from what the images say ({found:.0f} ± "
+            f"{structure.focal_sd:.0f} px), which is used"
+        )
+        return "self-calibrated"
+    return origin
 
 
 def warn_of_structure(context: StageContext, structure: Structure, ids: list[int]) -> None:

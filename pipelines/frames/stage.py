@@ -40,7 +40,7 @@ from ..sfm.calibration import intrinsics_inputs, read_intrinsics
 from ..sfm.driver import Structure
 from ..sfm.lens import Lens, distortion_of, make_lens
 from ..sfm.parallax import require_motion
-from ..sfm.rolling import read_readout
+from ..sfm.rolling import read_readout, straight_copy
 from ..sfm.window_size import window_size, windows_of
 from ..source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
 from ..source.known_poses import check_poses, given_poses, pose_inputs
@@ -48,7 +48,7 @@ from ..source.opening import FolderSource, Source, Warn, open_source
 from ..source.sharpness import reduce_image
 from ..system.parallel import parallel_map
 from ..types import Calibration, Frame, GivenPoses
-from .findings import in_world_of, settled_origin, warn_of_given, warn_of_structure
+from .findings import in_world_of, settled_origin, warn_of_focal, warn_of_given, warn_of_structure
 from .keyframes import KeyframeChoice, choose_keyframes
 from .learned import learned_inputs, open_learned
 from .masks import FrameMasks, check_masks, mask_inputs
@@ -93,6 +93,10 @@ def run(context: StageContext) -> dict[str, Any]:
         raise
     lens = make_lens(structure.model.cameras[1])
     origin = settled_origin(context, origin, camera, structure)
+    if len(rig) == 1:
+        times = np.array([frames[k].timestamp for k in keyframes])
+        straight = straight_copy(structure.model, [f.xy for f in structure.features], times, structure.readout)
+        origin = warn_of_focal(context, origin, camera, structure, straight)
     calibration = replace(_calibration(context, lens, origin, structure.focal_sd, faces), readout=structure.readout)
     _write_backbone(context, structure, keyframes, lens, frames)
     _write_correspondences(context, structure, keyframes, lens)

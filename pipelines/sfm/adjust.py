@@ -166,6 +166,20 @@ def _lens_covariance(model: pycolmap.Reconstruction, adjuster: pycolmap.CeresBun
     return np.asarray(block) * (max(median_error(model), _LEAST_NOISE) / 1.1774) ** 2
 
 
+def focals_of_halves(model: pycolmap.Reconstruction) -> list[tuple[float, float]]:
+    """Return the focal length and its standard deviation, in pixels, that the first and the second half of the views
+    tell, each adjusted by itself with the lens's distortion as it is; of few views what all of them tell."""
+    images = sorted(model.reg_image_ids())
+    middle = len(images) // 2 if len(images) >= _MIN_KEYFRAMES_TO_SPLIT else len(images)
+    halves, found = (images[:middle][:_SPLIT_VIEWS], images[middle:][-_SPLIT_VIEWS:]), []
+    for half in filter(None, halves):
+        part = _part(model, half)
+        solve(part, half, refine_camera=True, bend_lens=False, roughly=True)
+        covariance = _lens_covariance(part, solve(part, half, refine_camera=True, bend_lens=False))
+        found.append((float(part.cameras[1].mean_focal_length()), CORRELATED * math.sqrt(covariance[0, 0])))
+    return found
+
+
 def _difference_of_halves(model: pycolmap.Reconstruction, images: Sequence[int], bend_lens: bool) -> float:
     if len(images) < _MIN_KEYFRAMES_TO_SPLIT:
         return 0.0
@@ -175,8 +189,15 @@ def _difference_of_halves(model: pycolmap.Reconstruction, images: Sequence[int],
 
 
 def _focal_of(model: pycolmap.Reconstruction, images: Sequence[int], bend_lens: bool) -> float:
-    part = pycolmap.Reconstruction(model)
-    for image_id in sorted(set(model.reg_image_ids()) - set(images)):
-        part.deregister_frame(part.images[image_id].frame_id)
+    part = _part(model, images)
     solve(part, images, refine_camera=True, bend_lens=bend_lens, roughly=True)
     return float(part.cameras[1].focal_length)
+
+
+def _part(model: pycolmap.Reconstruction, images: Sequence[int]) -> pycolmap.Reconstruction:
+    part = pycolmap.Reconstruction(model)
+    for image_id in sorted(set(model.reg_image_ids()) - set(images)):
+        frame = part.images[image_id].frame_id
+        part.deregister_frame(frame)
+        part.frames[frame].rig_from_world = pycolmap.Rigid3d()  # the covariance asks for those of all frames
+    return part

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
 from msgs_slam.formats.datasets.sequence import Camera
+from msgs_slam.pipelines.frames.findings import warn_of_focal
 from msgs_slam.pipelines.sfm import focal as focal_module
 from msgs_slam.pipelines.sfm.focal import _errors, _rotation, calibrated, two_view_lens
 from msgs_slam.pipelines.sfm.lens import to_pycolmap, unknown_camera
-from tests.pipelines.frames.made_views import structure_of, walk_round
+from tests.pipelines.frames.made_views import MadeViews, structure_of, walk_round
 
 SIZE = (640, 480)
 GUESS = unknown_camera(*SIZE, 768.0, is_prior=False)
@@ -111,3 +114,37 @@ def test_derivatives_of_the_epipolar_error() -> None:
         turn[0, k] = 1e-6
         moved = u @ _rotation(turn[:, :3]), v @ _rotation(np.pad(turn[:, 3:], ((0, 0), (0, 1))))
         assert (_errors(*moved, x, y)[0] - error) / 1e-6 == pytest.approx(jacobian[..., k], abs=1e-4)
+
+
+def told_of(made: MadeViews, prior: pycolmap.Camera, origin: str, folder: Path) -> tuple[str, list[str]]:
+    """The final origin of the camera, and the warnings."""
+    found = structure_of(made, prior, folder, is_fixed=origin == "given")._calibrated(made.views(), made.pairs(prior))
+    assert found is not None
+    said: list[str] = []
+    around, structure = SimpleNamespace(warn=said.append), SimpleNamespace(**vars(found))
+    return warn_of_focal(around, origin, prior, structure, found.model), said  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("last", [520.0, 580.0])
+def test_a_zoom_is_noticed_and_a_walk_without_one_is_not_called_so(last: float, tmp_path: Path) -> None:
+    first, second = (walk_round(to_pycolmap(Camera(*SIZE, f, f, 320.0, 240.0)), 16) for f in (520.0, last))
+    made = replace(first, features=first.features[:8] + second.features[8:], seen=first.seen[:8] + second.seen[8:])
+    origin, said = told_of(made, GUESS, "self-calibrated", tmp_path)
+    assert origin == "self-calibrated"
+    assert ["the focal length seems to change: " in w and "52" in w and "58" in w for w in said] == [True] * (
+        last > 520
+    )
+
+
+@pytest.mark.parametrize("origin", ["exif", "given"])
+@pytest.mark.parametrize("stated", [520.0, 600.0])
+def test_a_known_focal_length_far_from_the_images_is_said_to_be(origin: str, stated: float, tmp_path: Path) -> None:
+    made = walk_round(to_pycolmap(Camera(*SIZE, 520.0, 520.0, 320.0, 240.0)), 16)
+    prior = unknown_camera(*SIZE, stated, is_prior=True)
+    final, said = told_of(made, prior, origin, tmp_path)
+    if stated == 520:
+        assert (final, said) == (origin, [])
+    else:
+        assert final == ("given" if origin == "given" else "self-calibrated")
+        assert len(said) == 1
+        assert ("--intrinsics (focal length 600 px) contradicts" if origin == "given" else "EXIF states") in said[0]
