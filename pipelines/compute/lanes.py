@@ -142,7 +142,7 @@ def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
 
 
 @intrinsic
-def counting(typing_context: Any, first: Any) -> Any:
+def iota(typing_context: Any, first: Any) -> Any:
     """first, first + 1, ... first + 15."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -173,7 +173,7 @@ def where(typing_context: Any, condition: Any, value: Any) -> Any:
 
 
 @intrinsic
-def at_most(typing_context: Any, value: Any, limit: Any) -> Any:
+def min_scalar(typing_context: Any, value: Any, limit: Any) -> Any:
     """The smaller of each lane and the limit."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -225,7 +225,7 @@ def add_totals(typing_context: Any, array: Any, index: Any, a: Any, b: Any, c: A
 
 
 @intrinsic
-def largest_of(typing_context: Any, value: Any) -> Any:
+def reduce_max(typing_context: Any, value: Any) -> Any:
     """The largest of the lanes."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
@@ -235,7 +235,7 @@ def largest_of(typing_context: Any, value: Any) -> Any:
 
 
 @intrinsic
-def largest(typing_context: Any, value: Any, other: Any) -> Any:
+def maximum(typing_context: Any, value: Any, other: Any) -> Any:
     """The larger of two numbers, lane by lane."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:

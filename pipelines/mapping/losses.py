@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..compute.jit import inner, kernel
-from ..compute.lanes import counting, load, splat, store, total, where
+from ..compute.lanes import iota, load, splat, store, total, where
 from ..compute.ssim import C1, C2, blur_array, ssim_map
 from ..compute.threads import for_each
 from .exposure import expose
@@ -186,7 +186,7 @@ def _similarity(
         store(out, 3 * size + i, by_var)
         store(out, 4 * size + i, by_cov)
         # The last band may reach over the end of the picture.
-        sums[1] += total(where(counting(np.float32(i - count)) < splat(_ZERO), value))
+        sums[1] += total(where(iota(np.float32(i - count)) < splat(_ZERO), value))
 
 
 @kernel

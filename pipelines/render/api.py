@@ -102,15 +102,15 @@ def pose_gradient(
 
 
 def kernels_for(backend: str | None, example: Tensor) -> ModuleType | None:
-    """The kernels that also project, where tensors like `example` take them; they need no culling before."""
+    """Return the kernels that also project, where tensors like `example` take them; they cull themselves."""
     if backend != "cuda" and (backend is not None or not gpu.supports_triton(example)):
         return None
     return choose_backend("cuda", example)
 
 
 def moved(cam_from_world: Tensor, twist: Tensor) -> Tensor:
-    """exp(twist) @ cam_from_world in the pose's own precision (float64 in this project); raises ValueError for NaN in
-    a twist on the CPU."""
+    """Return exp(twist) @ cam_from_world in the precision of the pose (float64 in this project); raises ValueError for
+    NaN in a twist on the CPU."""
     require_finite("twist", twist)
     return se3.exp(twist.to(cam_from_world.dtype)) @ cam_from_world
 
@@ -118,7 +118,7 @@ def moved(cam_from_world: Tensor, twist: Tensor) -> Tensor:
 def project_map(
     means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float = NEAR
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """u, v, sigma_px, z (M,) of the Gaussians in the camera; raises ValueError for NaN in what lies on the CPU."""
+    """Project Gaussians into a camera: u, v, sigma_px, z (M,); raises ValueError for NaN in what lies on the CPU."""
     for name, tensor in (("means", means), ("radii", radii), ("cam_from_world", cam_from_world)):
         require_finite(name, tensor)
     if means.device.type == "cpu" and means.dtype == torch.float32:
@@ -130,7 +130,7 @@ def project_map(
 
 
 def beside(numbers: Tensor, other: Tensor) -> Tensor:
-    """`numbers` where `other` lies and in its type; the gradient comes back in one copy."""
+    """Return `numbers` on the device and in the type of `other`; the gradient comes back in one copy."""
     if numbers.device == other.device:
         return numbers.to(other)
     return _Beside.apply(numbers, other)
@@ -148,7 +148,7 @@ class _Beside(torch.autograd.Function):
 
 
 def depth_ratio(depth_sum: Tensor, depth_silhouette: Tensor) -> Tensor:
-    """Depth sum / depth silhouette with value and gradient 0 where no Gaussian is seen."""
+    """Divide the depth sum by its silhouette, with value and gradient 0 where no Gaussian is seen."""
     seen = depth_silhouette > 1e-6
     return torch.where(seen, depth_sum / torch.where(seen, depth_silhouette, 1.0), 0.0)
 
@@ -227,7 +227,7 @@ def require_all_finite(tensors: Mapping[str, Tensor]) -> None:
 
 
 def choose_backend(backend: str | None, example: Tensor) -> ModuleType:
-    """The module that composites tensors like `example`; without a choice, the fastest that can."""
+    """Return the module that composites tensors like `example`; without a choice, the fastest that can."""
     name = backend or _fastest(example)
     if name == "reference":
         return reference
@@ -252,7 +252,7 @@ def _fastest(example: Tensor) -> str:
 
 @torch.no_grad()
 def in_view(means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float = NEAR) -> Tensor:
-    """(n,) indices of the Gaussians whose square reaches the image, a pixel to spare: no others take part in it."""
+    """List the indices (n,) of the Gaussians whose square reaches the image, a pixel to spare: no others count."""
     for name, tensor in (("means", means), ("radii", radii)):
         require_finite(name, tensor)
     k, pose = intrinsics, cam_from_world.to(means)
@@ -279,7 +279,7 @@ def in_view(means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: In
 def marked_in_view(
     means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float = NEAR
 ) -> Tensor:
-    """(M,) bool: which are `in_view`, of tensors of one card; unlike a list it keeps nobody waiting for its length."""
+    """Mark those `in_view`, (M,) bool, of tensors of one GPU; unlike a list it keeps nobody waiting for its length."""
     from .cuda_projection import mark_in_view  # imports triton
 
     return mark_in_view(means, radii, cam_from_world.to(means), intrinsics, near)

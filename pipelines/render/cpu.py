@@ -28,7 +28,7 @@ def composite(
     height: int,
     near: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Feature image (H, W, C), depth sum, depth silhouette and silhouette (H, W) of float32 CPU tensors."""
+    """Return the feature image (H, W, C), depth sum, depth silhouette and silhouette (H, W) of float32 CPU tensors."""
     return _Composite.apply(u, v, sigma_px, z, opacity, features, width, height, near)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..compute.jit import inner, kernel
-from ..compute.lanes import any_of, at_most, counting, exp, largest, load, splat, store, where
+from ..compute.lanes import any_of, exp, iota, load, maximum, min_scalar, splat, store, where
 from ..compute.threads import PART, for_each
 from . import reference
 
@@ -90,7 +90,7 @@ def split_into_bands(
     height: int,
     near: float,
 ) -> Bands:
-    """Everything about the Gaussians u, v, sigma_px, z, opacity (M,) and features (M, C) that bands need to know."""
+    """Sort out all about the Gaussians u, v, sigma_px, z, opacity (M,) and features (M, C) that bands need to know."""
     reach, first, starts, entries, slots = bin_gaussians(projected, width, height, near)
     bands = Bands(first, starts, entries, slots, [None] * (len(starts) - 1))  # type: ignore[list-item]
 
@@ -108,8 +108,8 @@ def split_into_bands(
 def bin_gaussians(
     projected: tuple[NDArray[np.float32], ...], width: int, height: int, near: float
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
-    """How far from its centre each Gaussian is seen, in pixels (M,), 0 where it is not seen at all; and the first four
-    fields of `Bands`, entries in the order of their indices."""
+    """Find how far from its centre each Gaussian is seen, in pixels (M,), 0 where it is not seen at all; and the first
+    four fields of `Bands`, entries in the order of their indices."""
     count, bands, parts = len(projected[0]), -(-height // BAND_ROWS), -(-len(projected[0]) // PART)
     reach, first, last = np.zeros(count, np.float32), np.zeros(count, np.int32), np.full(count, -1, np.int32)
     counts = np.zeros((parts, bands), np.int64)
@@ -166,8 +166,8 @@ def find_bands(
 def list_bands(
     start: int, first: NDArray[np.int32], last: NDArray[np.int32], places: NDArray[np.int64], entries: NDArray[np.int32]
 ) -> None:
-    """The indices, from `start` on, of Gaussians with a `first` and `last` band into the `entries` of these bands, from
-    the band's own of `places` (B,) on, which move along."""
+    """Enter the indices, from `start` on, of Gaussians with a `first` and `last` band into the `entries` of those,
+    from the band's own of `places` (B,) on, which move along."""
     for i in range(len(first)):
         for band in range(first[i], last[i] + 1):
             entries[places[band]] = start + i
@@ -175,7 +175,7 @@ def list_bands(
 
 
 def near_to_far(entries: NDArray[np.int32], z: NDArray[np.float32]) -> NDArray[np.int32]:
-    """The indices sorted by z > 0, equal depths in the order of their indices.
+    """Sort indices by z > 0, equal depths in the order of their indices.
 
     The bits of positive floats sort as the floats do: with the index behind them all keys differ, and numpy's fastest
     sort, which is not stable, gives one result.
@@ -197,7 +197,7 @@ def gather_band(
     features: NDArray[np.float32],
     channels: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The band's Gaussians side by side: records (n * RECORD,) and features padded with 0 to (n * channels,)."""
+    """Copy the band's Gaussians side by side: records (n * RECORD,) and features padded with 0 to (n * channels,)."""
     records = np.empty(len(entries) * RECORD, np.float32)
     padded = np.zeros(len(entries) * channels, np.float32)
     for k in range(len(entries)):
@@ -213,7 +213,7 @@ def gather_band(
 def list_tiles(
     records: NDArray[np.float32], top: int, width: int, rows: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Of a band from row `top`: the Gaussians that may touch tile t, near to far: members[starts[t]:starts[t + 1]]."""
+    """List who may touch tile t of a band from row `top`, near to far: members[starts[t]:starts[t + 1]]."""
     count = len(records) // RECORD
     across = (width + TILE - 1) // TILE
     tiles = across * ((rows + TILE - 1) // TILE)
@@ -251,16 +251,16 @@ def is_opaque(light: NDArray[np.float32]) -> bool:
     """Whether no pixel of the tile takes any more light."""
     most = load(light, 0)
     for y in range(1, TILE):
-        most = largest(most, load(light, TILE * y))
+        most = maximum(most, load(light, TILE * y))
     return not any_of(most >= _MIN_TRANSMITTANCE)
 
 
 @inner
 def row_opacity(y: int, light: Any, falloff_y: NDArray[np.float32], pair: tuple[Any, ...]) -> Any:
-    """Opacity of a Gaussian in the pixels of row y of a tile, 0 where it ends or no light arrives; see `walk_tiles`."""
+    """Return the opacity of a Gaussian in row y of a tile, 0 where it ends or no light arrives; see `walk_tiles`."""
     falloff_x, _, dx2, center, reach2, _ = pair
     dy = F32(y) + _HALF - center
-    alpha = at_most(falloff_x * falloff_y[y], _ALPHA_MAX)
+    alpha = min_scalar(falloff_x * falloff_y[y], _ALPHA_MAX)
     return where((dx2 <= splat(reach2 - dy * dy)) & (light >= _MIN_TRANSMITTANCE), alpha)
 
 
@@ -314,7 +314,7 @@ def walk_tiles(
             if x1 < x0 or y1 < y0:
                 continue
             sharpness = -_HALF / (records[at + 2] * records[at + 2])
-            dx, dy = counting(_HALF - u), counting(_HALF - v)
+            dx, dy = iota(_HALF - u), iota(_HALF - v)
             dx2 = dx * dx
             store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
             pair = (exp(dx2 * sharpness), dx, dx2, v, reach * reach, records[at + 3])

@@ -33,7 +33,7 @@ def padded_channels(channels: int) -> int:
 
 
 def draw_bands(bands: Bands, channels: int, width: int, height: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The image (H, W, channels) of all bands, and depth sum, depth silhouette and silhouette (3, H, W)."""
+    """Draw the image (H, W, channels) of all bands, and depth sum, depth silhouette and silhouette (3, H, W)."""
     features, planes = np.empty((height, width, channels), F32), np.empty((3, height, width), F32)
     vectors, padded = vectors_for(channels), padded_channels(channels)
     for_each_band(lambda b: forward_band(vectors, padded, b, *bands.prepared[b], features, planes), bands.starts)
@@ -87,7 +87,7 @@ def paint_rows(
     image: NDArray[np.float32], state: NDArray[np.float32], features: NDArray[np.float32], at: int, first: int,
     last: int,
 ) -> None:  # fmt: skip
-    """Three features, those from `at` on, into the three planes of a tile's image, sixteen pixels at once."""
+    """Add three features, those from `at` on, to the three planes of a tile's image, sixteen pixels at once."""
     red, green, blue = features[at], features[at + 1], features[at + 2]
     for row in range(TILE * first, TILE * last + TILE, TILE):
         weight = load(state, WEIGHTS + row)

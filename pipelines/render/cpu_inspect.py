@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..compute.jit import inlined, inner, kernel
-from ..compute.lanes import largest, largest_of, load, splat, store, total, where
+from ..compute.lanes import load, maximum, reduce_max, splat, store, total, where
 from .cpu_bands import PIXELS, TILE, Bands, clear, for_each_band, split_into_bands, walk_tiles
 from .cpu_forward import WEIGHTS, blend_rows, draw_bands
 
@@ -27,8 +27,8 @@ def inspect(
     u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, width: int, height: int, near: float,
     counts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Median depth (H, W), and summed and largest blending weight of each Gaussian, (M,) each; float32 CPU tensors. In
-    the sums a pixel counts as counts (H, W) says, as 1 where None."""
+    """Find the median depth (H, W), and the summed and largest blending weight of each Gaussian, (M,) each; float32 CPU
+    tensors. In the sums a pixel counts as counts (H, W) says, as 1 where None."""
     bands = bands_of((u, v, sigma_px, z, opacity), None, width, height, near)
     counted = torch.ones(height, width) if counts is None else counts
     median, found = _walk(bands, counted, torch.zeros(height, width, dtype=torch.uint8), 0)
@@ -39,7 +39,7 @@ def weighted_errors(
     u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, colors: Tensor, width: int, height: int,
     near: float, error_of: Callable[[Tensor], Tensor],
 ) -> Tensor:  # fmt: skip
-    """(M,) blending weights of each Gaussian, summed over the pixels, each weighed with its error: `error_of` the
+    """Sum the blending weights (M,) of each Gaussian over the pixels, each weighed with its error: `error_of` the
     (H, W, 3) colours that are shown, (H, W); float32 CPU tensors."""
     bands = bands_of((u, v, sigma_px, z, opacity), colors, width, height, near)
     shown, _ = draw_bands(bands, 3, width, height)
@@ -51,7 +51,7 @@ def class_weights(
     u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, near: float, counts: Tensor, channels: Tensor,
     classes: int,
 ) -> Tensor:  # fmt: skip
-    """(M, classes) blending weights of each Gaussian, summed over the pixels of each of the channels (H, W) uint8; what
+    """Sum the blending weights (M, classes) of each Gaussian over the pixels of each of the channels (H, W) uint8; what
     is no class counts nothing, the others as counts (H, W) says; float32 CPU tensors."""
     height, width = channels.shape
     bands, known = bands_of((u, v, sigma_px, z, opacity), None, width, height, near), channels < classes
@@ -59,7 +59,7 @@ def class_weights(
 
 
 def bands_of(gaussians: tuple[Tensor, ...], colors: Tensor | None, width: int, height: int, near: float) -> Bands:
-    """The bands of projected Gaussians, with or without three features."""
+    """Make the bands of projected Gaussians, with or without three features."""
     projected = tuple(tensor.detach().contiguous().numpy() for tensor in gaussians)
     features = np.zeros((len(projected[0]), 0), F32) if colors is None else colors.detach().contiguous().numpy()
     return split_into_bands(projected, features, features.shape[1], width, height, near)
@@ -110,13 +110,13 @@ def weigh(
     summed, top_weight = splat(_ZERO), splat(_ZERO)
     for row in range(TILE * y0, TILE * y1 + TILE, TILE):
         weight, behind = load(state, WEIGHTS + row), load(light, row)
-        summed, top_weight = summed + weight * load(state, COUNT + row), largest(top_weight, weight)
+        summed, top_weight = summed + weight * load(state, COUNT + row), maximum(top_weight, weight)
         before = load(state, MEDIAN + row)
         here = (behind < splat(_HALF)) & (weight > splat(_ZERO)) & (before <= splat(_ZERO))
         store(state, MEDIAN + row, before + where(here, splat(pair[5])))
     sum_here = total(summed)
     seen[i, 0] += sum_here
-    seen[i, 1] = max(seen[i, 1], largest_of(top_weight))
+    seen[i, 1] = max(seen[i, 1], reduce_max(top_weight))
     if seen.shape[1] > 2 and classes[IS_MIXED] == 0:  # most tiles show one class
         seen[i, 2 + max(classes[ONLY], 0)] += sum_here
     elif seen.shape[1] > 2:

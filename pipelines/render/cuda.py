@@ -33,7 +33,7 @@ def composite(
     height: int,
     near: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Feature image (H, W, C), depth sum, depth silhouette and silhouette (H, W) of float32 tensors on one card."""
+    """Return the feature image (H, W, C), depth sum, depth silhouette and silhouette (H, W) of tensors on one GPU."""
     records = record((u, v, sigma_px, z, opacity), width, height, near)
     return composite_records(records, features, width, height)
 
@@ -77,7 +77,7 @@ def inspect_records(
 
 
 def depth_ratio(depth_sum: Tensor, depth_silhouette: Tensor) -> Tensor:
-    """`rendering.depth_ratio` of tensors on one card."""
+    """Divide sums as `api.depth_ratio`, of tensors on one GPU."""
     return _Ratio.apply(depth_sum, depth_silhouette)
 
 

@@ -37,7 +37,7 @@ def record(geometry: tuple[Tensor, ...], width: int, height: int, near: float) -
 
 
 def mark_in_view(means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float) -> Tensor:
-    """(M,) bool: what `culling.in_view` lists."""
+    """(M,) bool: what `api.in_view` lists."""
     marks = torch.empty(len(means), dtype=torch.bool, device=means.device)
     given = (means.detach().contiguous(), radii.detach().contiguous(), cam_from_world.detach().contiguous())
     _run(mark_rows, len(means), *given, marks.view(torch.uint8), *_camera(intrinsics, near), **_CUT)
@@ -122,7 +122,7 @@ def store_record(
     opacity: tl.tensor, width: tl.tensor, height: tl.tensor, near: tl.tensor,
     ALPHA_MIN: tl.constexpr, CUT_SIGMAS: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Store them with their reaches; see `rules`."""
+    """Store them with their reaches; see `reference`."""
     reach2 = tl.minimum(2.0 * tl.log(tl.maximum(opacity / ALPHA_MIN, 1.0)), CUT_SIGMAS * CUT_SIGMAS)
     reach = tl.maximum(sigma, 0.0) * tl.sqrt(reach2)
     seen = (z > near) & (u + reach >= 0.5) & (u - reach <= width - 0.5)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...compute.jit import inner, kernel
-from ...compute.lanes import any_of, at_most, counting, exp, largest, load, splat, store, where
+from ...compute.lanes import any_of, exp, iota, load, maximum, min_scalar, splat, store, where
 from .lane_sampling import choose, corners, smallest
 from .volume import Bands
 
@@ -50,10 +50,10 @@ def _sample(depth: NDArray[np.float32], width: int, height: int, px: Any, py: An
     the nearest pixel's depth."""
     right, bottom = np.float32(width - 1), np.float32(height - 1)
     whole = (px >= _ZERO) & (py >= _ZERO) & (px < right) & (py < bottom)
-    inner_x = at_most(largest(px, splat(_ZERO)), right - _RIM)
-    inner_y = at_most(largest(py, splat(_ZERO)), bottom - _RIM)
+    inner_x = min_scalar(maximum(px, splat(_ZERO)), right - _RIM)
+    inner_y = min_scalar(maximum(py, splat(_ZERO)), bottom - _RIM)
     a, b, c, d, fx, fy = corners(depth, width, inner_x, inner_y)
-    low, high = smallest(smallest(a, b), smallest(c, d)), largest(largest(a, b), largest(c, d))
+    low, high = smallest(smallest(a, b), smallest(c, d)), maximum(maximum(a, b), maximum(c, d))
     whole = whole & (low > _ZERO) & (high - low <= low * (_THREE * tolerance))
     above = splat(_ONE) / a + fx * (splat(_ONE) / b - splat(_ONE) / a)
     below = splat(_ONE) / c + fx * (splat(_ONE) / d - splat(_ONE) / c)
@@ -84,7 +84,7 @@ def _fuse_band(
                 for k in range(1, 4):
                     store(rows[k], x, splat(_ZERO))
                 continue
-            known, u, v = z > _ZERO, counting(np.float32(x) + _HALF), np.float32(y) + _HALF
+            known, u, v = z > _ZERO, iota(np.float32(x) + _HALF), np.float32(y) + _HALF
             weights, total, against = splat(_ONE), choose(known, splat(_ONE) / z, splat(_ONE)), splat(_ZERO)
             for n in range(len(others)):
                 w, b = warps[n], back_rows[n]
@@ -103,7 +103,7 @@ def _fuse_band(
                 off = (seen - qz) * scale
                 against = against + where(shown & (off > _FOUR * tolerance), splat(_ONE))
                 back = seen * (ou * b[0] + ov * b[1] + b[2]) + b[3]
-                agrees = shown & (largest(off, splat(_ZERO) - off) < _THREE * tolerance) & (back > _ZERO)
+                agrees = shown & (maximum(off, splat(_ZERO) - off) < _THREE * tolerance) & (back > _ZERO)
                 off = where(agrees, off * (_ONE / tolerance))
                 weight = where(agrees, exp(off * off * -_HALF))
                 weights, total = weights + weight, total + weight / choose(agrees, back, splat(_ONE))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...compute.jit import inner, kernel
-from ...compute.lanes import at_most, counting, exp, largest, load, splat, store, where
+from ...compute.lanes import exp, iota, load, maximum, min_scalar, splat, store, where
 from .lane_sampling import choose, interpolate, smallest, square_root
 from .volume import BAND_ROWS
 
@@ -88,7 +88,7 @@ def weigh_windows(
                 store(weights, own + tap * length, load(weights, own + tap * length) * share)
             mean = mean * share
             store(moments, 2 * k * length + x, mean)
-            store(moments, (2 * k + 1) * length + x, largest(square * share - mean * mean, splat(_ZERO)))
+            store(moments, (2 * k + 1) * length + x, maximum(square * share - mean * mean, splat(_ZERO)))
     return weights, moments
 
 
@@ -132,16 +132,16 @@ def warp_row(
         if not needed[block]:
             continue
         x = block * _LANES
-        w, u = load(inverse_depths, x) + np.float32(offset), counting(np.float32(x - RADIUS) + _HALF)
-        u = at_most(largest(u, splat(_HALF)), np.float32(width) - _HALF)
+        w, u = load(inverse_depths, x) + np.float32(offset), iota(np.float32(x - RADIUS) + _HALF)
+        u = min_scalar(maximum(u, splat(_HALF)), np.float32(width) - _HALF)
         z = u * az + bz + w * tz
-        scale = _ONE / largest(z, splat(_NEAR))
+        scale = _ONE / maximum(z, splat(_NEAR))
         across = (u * ax + bx + w * tx) * scale - _HALF
         down = (u * ay + by + w * ty) * scale - _HALF
         inside = (z > _NEAR) & (across >= -_HALF) & (down >= -_HALF)
         inside = inside & (across <= right + _HALF) & (down <= bottom + _HALF)
         store(seen, at + x, where(inside, splat(_ONE)))
-        across, down = at_most(largest(across, splat(_ZERO)), right), at_most(largest(down, splat(_ZERO)), bottom)
+        across, down = min_scalar(maximum(across, splat(_ZERO)), right), min_scalar(maximum(down, splat(_ZERO)), bottom)
         store(samples, at + x, interpolate(other, columns, across, down))
 
 
@@ -167,7 +167,7 @@ def correlate(
             value = load(samples, start + tap)
             part = load(weights, own + (j * SIDE + i) * length) * value
             total, square, product = total + part, square + part * value, product + part * load(reference, tap)
-    variance = largest(square - total * total, splat(_ZERO))
+    variance = maximum(square - total * total, splat(_ZERO))
     covariance = product - total * load(moments, 2 * k * length + x)
     value = covariance / square_root((variance + _FLOOR) * (load(moments, (2 * k + 1) * length + x) + _FLOOR))
     # Samples of what is no scene are NaN, and so is what is made of them: it compares with nothing.
@@ -196,14 +196,14 @@ def best_mean(
         score = correlate(samples, seen, weights, reference, moments, length, n * SAMPLED_ROWS * length, k, x)
         for b in range(0, len(top), _LANES):
             before = load(top, b)
-            store(top, b, largest(before, score))
+            store(top, b, maximum(before, score))
             score = smallest(before, score)
     total, used = splat(_ZERO), splat(_ZERO)
     for b in range(0, len(top), _LANES):
         score = load(top, b)
         total = total + where(score > _OUTSIDE, score)
         used = used + where(score > _OUTSIDE, splat(_ONE))
-    return total / largest(used, splat(_ONE))
+    return total / maximum(used, splat(_ONE))
 
 
 @kernel
