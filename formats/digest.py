@@ -1,7 +1,5 @@
 """Hashes of a file's content, or of a list of files."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The tags of EXIF as numbers that can be used: the lens, the place, the orientation."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Splat files of every kind that can be read here."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

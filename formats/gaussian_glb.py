@@ -6,8 +6,6 @@ do not know the extension: they show a cloud of coloured points. With KHR_gaussi
 draft) the attributes are an SPZ file of version 2 in a buffer view: a tenth of the size, and all that CesiumJS draws.
 """
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from typing import Any

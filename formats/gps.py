@@ -1,7 +1,5 @@
 """Places on the Earth: GPS of images and tracks, and the local east-north-up frame."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

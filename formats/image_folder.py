@@ -1,7 +1,5 @@
 """The images of a folder: which they are, their order, and when they were taken."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

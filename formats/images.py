@@ -1,7 +1,5 @@
 """Image files to arrays and back: colour, depth, labels, and what the camera wrote beside the image."""
 
-from __future__ import annotations
-
 import io
 import warnings
 from collections.abc import Iterator, Sequence

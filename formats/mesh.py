@@ -1,7 +1,5 @@
 """Labelled triangle meshes in PLY and GLB, and textured ones in OBJ and GLB."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path

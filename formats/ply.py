@@ -1,8 +1,6 @@
 """PLY files: tables of vertices read with limits and written in blocks, clouds of points, and Gaussian splats in the
 layout of the original 3D Gaussian splatting (Kerbl et al. 2023)."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence

@@ -7,8 +7,6 @@ apps on phones write beside their images, all of them ARKit's in metres:
 - Record3D, images with `metadata.json` (or `metadata`): `poses`, for each image qx, qy, qz, qw, px, py, pz.
 - Stray Scanner: `odometry.csv` with the columns timestamp, frame, x, y, z, qx, qy, qz, qw, camera axes as OpenCV's."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterable

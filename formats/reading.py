@@ -1,7 +1,5 @@
 """The door for files and paths from outside: what is opened, how much of it, and what its damage is called."""
 
-from __future__ import annotations
-
 import errno
 import os
 import posixpath

@@ -4,8 +4,6 @@ Version 2 by developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog
 in practice those of splat PLYs (x right, y down, z forward): so its own converter writes what it reads of SPZ.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

@@ -4,8 +4,6 @@ Version 4 is a plain header, a table and a Zstandard stream for each attribute; 
 Layout by the README of github.com/nianticlabs/spz; version 2 keeps rotations in three bytes, the others in four.
 """
 
-from __future__ import annotations
-
 import gzip
 import io
 import struct

@@ -1,7 +1,5 @@
 """Text files: rows of numbers, JSON and TOML, read with a limit and with the place of an error."""
 
-from __future__ import annotations
-
 import codecs
 import json
 import math

@@ -1,7 +1,5 @@
 """Trajectories as text: TUM lines and 4x4 matrices."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -5,8 +5,6 @@ video: each frame holds two fields (half pictures) of different times, or is one
 cannot convert such frames, and does not say so: it hands out whatever its buffer held before, black, the last frame, or
 a picture of another video."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import itertools

@@ -1,7 +1,5 @@
 """Writing videos: with what OpenCV brings along, and for browsers by H.264 where PyAV is installed."""
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """`msgs-slam doctor`: what is installed, and what to do about what is not."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`msgs-slam extend`: more videos for a finished run."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

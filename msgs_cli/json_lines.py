@@ -4,8 +4,6 @@
 of result, stopped, error at the end.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import os

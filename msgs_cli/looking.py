@@ -1,7 +1,5 @@
 """Commands that look at a run: status, evaluate, report, render, view."""
 
-from __future__ import annotations
-
 import json
 import re
 import signal

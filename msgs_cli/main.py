@@ -1,7 +1,5 @@
 """`msgs-slam`: a plain video in; camera poses, a semantic Gaussian map and a labelled mesh out."""
 
-from __future__ import annotations
-
 import errno
 import os
 import signal

@@ -1,7 +1,5 @@
 """Progress at a terminal: one tqdm bar a piece of work."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable, Iterator
 from typing import TypeVar

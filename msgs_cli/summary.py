@@ -1,7 +1,5 @@
 """The last words of a command that has brought a run to its end: table, warnings, where the results are."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Text for the terminal: control characters are escaped, and nothing is dropped silently."""
 
-from __future__ import annotations
-
 import logging
 import os
 import sys

@@ -1,7 +1,5 @@
 """`msgs-slam work`: one of many processes at one run."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

@@ -4,8 +4,6 @@ A recording's run folder is all that is known of it, and its lock sees to it tha
 any number of batches over the same folders may be started, killed and started again, on one machine or many.
 """
 
-from __future__ import annotations
-
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

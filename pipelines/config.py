@@ -1,7 +1,5 @@
 """Every setting, its default and its meaning, once; `read_config` reads and writes them."""
 
-from __future__ import annotations
-
 from dataclasses import Field, dataclass, field, fields, is_dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The demo: a short synthetic video with known truth, reconstructed like any other video, judged against the truth."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Check of this machine: a line for each thing the program needs, and what to do where it is missing."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.metadata
 import importlib.util

@@ -3,8 +3,6 @@
 Unknown keys and wrong types are refused with the nearest name; what was a setting once, with what became of it.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import math

@@ -1,7 +1,5 @@
 """The whole pipeline from a source to a finished run, for the commands `reconstruct`, `resume` and `status`."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Status of a run, for people and for programs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """Triton's kernels compiled for cards, which needs none: the interpreter accepts more than the compiler does."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Poses as text, for readers of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

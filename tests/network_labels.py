@@ -1,7 +1,5 @@
 """Labels of a network alone, at an image's own pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@
 - TUM RGB-D: rgb.txt, depth.txt and groundtruth.txt, each with its own clock times.
 - EuRoC MAV, left camera: mav0/cam0 with data.csv and sensor.yaml."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

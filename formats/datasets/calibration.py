@@ -1,8 +1,6 @@
 """Intrinsics in files of data sets and of other programs: our own JSON; ROS, Kalibr, EuRoC and ORB-SLAM (YAML),
 OpenCV (YAML, XML), ARKit, Open3D and RealSense (JSON), COLMAP (text, binary), KITTI and Middlebury (text)."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Classes of label images: the tables in which data sets name them."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A COLMAP project: images and the poses that COLMAP found for them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plain folders: images, with companion files under the usual names."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which depth map, label image or pose row belongs to which colour image."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """nerfstudio's transforms.json (also instant-ngp's and Blender's), read as a data set and written for its trainers."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which data set a folder or file is, and opening it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches

@@ -1,7 +1,5 @@
 """Replica in the three layouts in which the field passes it on."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """ScanNet: scenes as color/, depth/, pose/, intrinsic/ and label-filt/, and the .sens files they are exported from."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from dataclasses import dataclass

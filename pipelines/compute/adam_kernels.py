@@ -3,8 +3,6 @@
 The interpreter of Triton (environment variable TRITON_INTERPRET=1) runs it on CPU tensors.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

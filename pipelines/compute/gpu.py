@@ -1,7 +1,5 @@
 """Which tensors the Triton kernels take, and how one of them is started."""
 
-from __future__ import annotations
-
 import functools
 import importlib.metadata
 from typing import Any

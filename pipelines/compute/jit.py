@@ -1,7 +1,5 @@
 """The renderer's kernels: products and sums may be fused into one instruction, in the same way for any thread count."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -5,8 +5,6 @@ times slower). Here the vectors are written down: `Lanes` add, multiply and comp
 of a comparison. Everything here can be used in functions compiled by numba only. Array indices are not checked.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable
 from typing import Any

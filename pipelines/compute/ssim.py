@@ -1,7 +1,5 @@
 """Structural similarity with its own gradient: eight blurs in all, where autograd would keep every product."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

@@ -1,7 +1,5 @@
 """One pool of threads for the CPU kernels, which run without the GIL."""
 
-from __future__ import annotations
-
 import itertools
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Depth from a folder of files, ground truth or the user's own model's, and which file of a folder is which frame's."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Learned and multi-view depth together: the geometry leads where views agree, the network fills and sets metres."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

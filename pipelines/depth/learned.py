@@ -1,7 +1,5 @@
 """Depth by a network that a card describes; where it is relative, brought to the unit of the run's points."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Length of the backbone's unit in the unit of a depth: metres per unit when the depth is metric."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 

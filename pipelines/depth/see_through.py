@@ -1,7 +1,5 @@
 """Removal of depth in front of what other views see there: it is wrong, and would become a floater."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

@@ -6,8 +6,6 @@ only, which is tried once more; one whose machine is gone is started elsewhere. 
 with its parent: it stops softly then (`stop_with_parent`).
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import signal

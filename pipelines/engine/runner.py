@@ -1,7 +1,5 @@
 """Running the stages: what is up to date stays, what is not runs, what was interrupted goes on."""
 
-from __future__ import annotations
-
 import gc
 import resource
 import shutil

@@ -1,7 +1,5 @@
 """Whether a finished stage is what its settings, its inputs and this program would make, and if not, why."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Findings of structure from motion for the user: gaps, contradictions, and what became of given poses and cameras."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Keyframes by parallax: how far points tracked from the last keyframe have moved."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ The networks are the files that COLMAP publishes for itself. pycolmap's wheels a
 ("requires ONNX support"), so that onnxruntime does; names, padding and thresholds are COLMAP's (feature/aliked.h, 4.2).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

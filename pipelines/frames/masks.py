@@ -1,7 +1,5 @@
 """Masks of the frames: files of the user, read as the source reads its images, and people found by networks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

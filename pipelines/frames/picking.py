@@ -1,7 +1,5 @@
 """Which images of a source become frames, and how they are stored until the lens is known."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 
 from ...formats.atomic import copy_file

@@ -1,7 +1,5 @@
 """A prior focal length that leaves no structure or that the images contradict: dropped before these are blamed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Stage 1: pictures of the source become frames with timestamps, a calibrated camera and a backbone of keyframes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Structure from motion as tasks, and what it starts from: images that were picked, their camera, masks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial

@@ -1,7 +1,5 @@
 """Rigid pinhole cameras: projection, and images resampled to another size."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import torch

@@ -1,7 +1,5 @@
 """A depth image with its camera: what the views of a scene are compared by."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """A camera that looks in several directions at once: each panorama is the six sides of a cube about its centre."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

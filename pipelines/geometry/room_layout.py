@@ -1,7 +1,5 @@
 """Floor, ceiling, walls and table tops of a room, from the normals and heights of its surfaces."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

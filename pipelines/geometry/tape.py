@@ -1,7 +1,5 @@
 """The measuring tape: where a line of sight meets the map, how sure that is, and how far apart two such places are."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

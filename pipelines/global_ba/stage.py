@@ -1,7 +1,5 @@
 """Stage 5: loops, the global adjustment, and the map moved and refined with it (MSGS-SLAM 3.5)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

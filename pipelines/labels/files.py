@@ -1,7 +1,5 @@
 """Labels from a folder of images: the truth in tests, or the user's own model."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType

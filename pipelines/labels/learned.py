@@ -1,8 +1,6 @@
 """Classes by a network that a card describes, brought together over the video in the world; without names, clusters of
 its features."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

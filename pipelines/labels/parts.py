@@ -1,8 +1,6 @@
 """Cutting what is no floor, wall or ceiling into parts: graph-based segmentation over neighbouring voxels
 (Felzenszwalb and Huttenlocher, IJCV 2004)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@ All frames' depths are gathered in one grid of voxels, the grid is cut into floo
 and every frame reads its labels from the grid. So a class means the same in the whole video.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

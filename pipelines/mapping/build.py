@@ -1,8 +1,6 @@
 """The map, made and refined submap by submap: at any time no more than one of them is in work. A recording of the
 usual length is one submap."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Exposure of a view: gain and offset of each colour from the map to its photo, and one common exposure for submaps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations

@@ -1,7 +1,5 @@
 """The map of a run that was extended: the one that was there, grown where the added images look."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

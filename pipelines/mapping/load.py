@@ -1,7 +1,5 @@
 """Loading of views from the run folder: the frames that make the map, and those that only measure it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ The sums are atomic additions: their last bits may differ from run to run. The i
 variable TRITON_INTERPRET=1) runs these kernels on CPU tensors.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

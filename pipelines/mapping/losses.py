@@ -1,7 +1,5 @@
 """Terms of the mapping loss (MSGS-SLAM eqs. 18-20): colour, depth, size and silhouette, scalars without a unit."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any
 

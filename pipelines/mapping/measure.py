@@ -1,7 +1,5 @@
 """Renderings of the finished map: what a view shows (depth, colours, classes), and its PSNR, SSIM, depth and labels."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Map and trajectory follow keyframes that have moved: each Gaussian its anchor, each frame its neighbours in time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

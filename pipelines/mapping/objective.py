@@ -1,7 +1,5 @@
 """Objective of the map: the loss of one view, MSGS-SLAM eq. (18), by autograd on the CPU, in one pass on a GPU."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Optimising the map against its views: seed along the keyframes, then visit all of them in random order."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial, reduce

@@ -1,7 +1,5 @@
 """New Gaussians from the pixels of a view, at its depth."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import reduce

@@ -1,7 +1,5 @@
 """Stage 4: the semantic Gaussian map from the keyframes (MSGS-SLAM 3.4)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

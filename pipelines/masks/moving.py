@@ -7,8 +7,6 @@ lie outside what the others see: at first only those accuse that have its place 
 CVPR 2023) too leaves out what the rest of the views does not agree on, there while a map is fitted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache

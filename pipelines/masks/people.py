@@ -4,8 +4,6 @@ Either alone takes things for people: on eleven images in twelve of empty rooms 
 sure of was a person, but for one rucksack in 70 images of 7 recordings.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2

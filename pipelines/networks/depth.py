@@ -1,7 +1,5 @@
 """Depth by a network."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ and fetches through requests. Resuming, mirrors and the checks of what a server 
 downloader: with them here, the few lines that are left to do cost less than the dependency.
 """
 
-from __future__ import annotations
-
 import errno
 import http.client
 import json

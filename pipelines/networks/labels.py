@@ -1,7 +1,5 @@
 """Class probabilities by a network."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A network over many frames: nothing is computed twice, and a long pass says beforehand how long."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import time

@@ -5,8 +5,6 @@ for small quantised networks as phones run them; it runs on the CPU whatever the
 second. Both libraries load slowly, and are imported where a network is opened.
 """
 
-from __future__ import annotations
-
 import mmap
 import os
 import sys

@@ -8,8 +8,6 @@ card's background phrases too (as in LERF, Kerr et al., ICCV 2023), which togeth
 which a lamp and a shelf are asked for would consist of lamps and shelves.
 """
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Inputs of the stage beside the frames: the user's files and networks, checked before anything slow starts."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -3,8 +3,6 @@
 Digits that mean nothing are rounded off before the maps are compressed.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

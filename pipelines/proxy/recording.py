@@ -1,7 +1,5 @@
 """Depth and labels that a data set has of its own frames: its sensor's or its annotators'."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property

@@ -3,8 +3,6 @@
 The user knows a distance in one image, how high the camera was held, or poses in metres.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass

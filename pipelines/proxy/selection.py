@@ -1,7 +1,5 @@
 """Selection of providers by the text of the settings."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from difflib import get_close_matches

@@ -1,7 +1,5 @@
 """Stage 2: depth, its reliability, and classes of the keyframes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

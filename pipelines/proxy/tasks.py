@@ -1,7 +1,5 @@
 """A proxy stage as tasks over ranges of its frames: networks, depths, what moved, maps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Drawing a map from a camera: projection (MSGS-SLAM eq. 5) around the compositing of eq. (6)-(9)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import ModuleType

@@ -1,7 +1,5 @@
 """The renderer on CPUs: compiled band kernels behind one autograd operation."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -5,8 +5,6 @@ Gaussian's values with the gradient of the pixel and S the sum of weight * q of 
 d loss / d alpha = light * q - S / (1 - alpha).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

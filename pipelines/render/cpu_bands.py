@@ -4,8 +4,6 @@ Everything is sized by a first counting pass, so a Gaussian may cover any number
 state of its pixels in planes of `PIXELS` numbers, row after row of `TILE`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

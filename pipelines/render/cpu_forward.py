@@ -1,7 +1,5 @@
 """Blending a band: Gaussians outermost, then the rows of a tile, sixteen pixels of a row at once."""
 
-from __future__ import annotations
-
 from typing import Any, TypeAlias
 
 import numpy as np

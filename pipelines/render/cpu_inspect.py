@@ -1,7 +1,5 @@
 """One forward walk that keeps what an image does not show: median depth, and how much each Gaussian was seen."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

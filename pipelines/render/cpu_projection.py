@@ -1,7 +1,5 @@
 """World Gaussians to an image on CPUs (MSGS-SLAM eq. 5): one pass there and one back."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -3,8 +3,6 @@
 Gradients are summed by atomic additions: their last bits may differ from run to run.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

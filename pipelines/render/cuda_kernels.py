@@ -6,8 +6,6 @@ atomic addition per Gaussian and value. The interpreter of Triton (environment v
 kernels on CPU tensors.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

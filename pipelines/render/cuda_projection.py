@@ -4,8 +4,6 @@ A record is what the other kernels read of a Gaussian: u, v, sigma_px, z, opacit
 not in the image. Gradients of the pose are summed by atomic additions: their last bits may differ from run to run.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

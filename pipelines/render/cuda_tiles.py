@@ -1,7 +1,5 @@
 """Which Gaussians may touch which tile of an image, near to far: lists made and sorted on the card."""
 
-from __future__ import annotations
-
 import torch
 import triton
 import triton.language as tl

@@ -1,7 +1,5 @@
 """Forward-only views of the map: the depth of surfaces, and how much each Gaussian takes part in an image."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType

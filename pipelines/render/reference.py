@@ -9,8 +9,6 @@ increasing depth, ties by index. A pixel takes no more of them once its transmit
 TRANSMITTANCE_MIN.
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from typing import Any

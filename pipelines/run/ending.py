@@ -10,8 +10,6 @@
 A later process that finds such a record takes the stage over if every file is as the record says.
 """
 
-from __future__ import annotations
-
 import glob
 import os
 import shutil

@@ -10,8 +10,6 @@
 into the folder of the running stage (`RunFile.save`). The table of the files is `run/files.py`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields, replace
 from itertools import count, takewhile
 from pathlib import Path, PurePosixPath

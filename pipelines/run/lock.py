@@ -1,7 +1,5 @@
 """One process at a time works on a run: it holds a lock or, on a disk without locks, a file that it keeps touching."""
 
-from __future__ import annotations
-
 import _thread
 import fcntl
 import json

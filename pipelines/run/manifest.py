@@ -1,7 +1,5 @@
 """The manifest of a run, manifest.json: one record for each finished stage."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

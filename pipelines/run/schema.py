@@ -5,8 +5,6 @@ b (booleans), u (text); a letter is a length that is the same wherever it occurs
 missing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import partial

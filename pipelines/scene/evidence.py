@@ -8,8 +8,6 @@ that things are made to; how far real ones scatter around them is our judgement,
 tolerances. Nothing here was fitted to a recording.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 The exported world is laid onto them: z is up already, so a turn about it, a scale and a shift are left.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

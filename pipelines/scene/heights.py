@@ -1,7 +1,5 @@
 """Heights in a room: the camera and the ceiling over the floor, tables, seats and beds over it, and doors."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Metres per unit of a run from everything that is known of it, with an honest standard deviation."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,8 +1,6 @@
 """The scale where the run is metric already (a reference, depth files, a metric network), and by a network that was
 trained on metric depth."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -5,8 +5,6 @@ the plane's normal n is across it: n . up = 0 for every upright line, whatever i
 known, the lines of all images vote together (the vanishing point of all cameras at once).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 

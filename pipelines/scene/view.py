@@ -1,7 +1,5 @@
 """Inputs of the scale estimate: the surface that the keyframes saw, its classes, the gravity direction, the cameras."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The world of the exported files, and the transform from the run's own to it."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, field
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The last bundle adjustment of the backbone, and how sure it is of the focal length."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Conversion of pycolmap's reconstruction to the arrays that the other stages read."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np

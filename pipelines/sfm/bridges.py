@@ -5,8 +5,6 @@ behind it, but hardly one that does both: then how long the steps on both sides 
 few points or on none. Corners followed by optical flow need less of an image than descriptors that are alike do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 

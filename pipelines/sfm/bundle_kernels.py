@@ -9,8 +9,6 @@ order of the observations, in one thread: the same input gives the same bytes.
 from (-1 for none), xy (O, 2), inverse_sd (O,), log_depth (O,), depth_weight (O,) and the width of the robust loss.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The camera's calibration as the user gives it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from ...formats.datasets.calibration import read_calibration_file

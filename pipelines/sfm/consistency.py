@@ -1,7 +1,5 @@
 """Agreement of a model with the matches it was made from."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

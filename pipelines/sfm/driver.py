@@ -1,7 +1,5 @@
 """Structure from motion over the keyframes: features, matches, poses and points, the camera."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence

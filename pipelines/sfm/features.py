@@ -4,8 +4,6 @@ COLMAP's: OpenCV's takes 40 % of its time, and the path of all frames is as good
 classroom half as far off again (tests/benchmarks/README.md).
 """
 
-from __future__ import annotations
-
 import threading
 
 import cv2

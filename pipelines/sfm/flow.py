@@ -1,7 +1,5 @@
 """Subpixel correspondences by pyramidal Lucas-Kanade, checked forwards and backwards."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -10,8 +10,6 @@ A lens that bends lines is looked for by the way: as a division model (Fitzgibbo
 multiple view geometry and lens distortion, CVPR 2001), without which the focal length is up to 40 % off.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Poses that the user brings: what they say beside those found here, and a model that starts from them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A calibrated lens, and the frames without its distortion."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """Feature matches of two keyframes, and their geometric verification."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Whether the camera moved, or only turned."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -5,8 +5,6 @@ vocabulary learnt from the run itself. It replaces the paper's DINOv2 features, 
 them where there are any.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 

@@ -7,8 +7,6 @@ that displacement is taken away are adjusted as if they had been seen at once. H
 of the camera, found in closed form beside all poses and points.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

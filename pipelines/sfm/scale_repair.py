@@ -5,8 +5,6 @@ size throws away what contradicts it, the features matched on both sides, though
 once from the cameras before and once from those behind it, give the scale of one side against the other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

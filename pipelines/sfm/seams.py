@@ -4,8 +4,6 @@ The share of agreeing pairs over a whole model hides one bad place among hundred
 what crosses between one keyframe and the next.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Snapshots of the features, matches and models found so far, from which a killed run resumes."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Into how many windows structure from motion divides a long recording: by its length, and the memory that is given."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -4,8 +4,6 @@ A mapper's memory grows by half a megabyte to two a keyframe, nearly all of it i
 one window is in work at any time. What is joined is adjusted by `pipelines.structure.bundle`, which needs a tenth.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field

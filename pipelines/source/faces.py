@@ -3,8 +3,6 @@
 A panorama becomes six images, the sides of a cube; a fisheye of known lens one, of the width that fits.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar

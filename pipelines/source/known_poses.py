@@ -1,7 +1,5 @@
 """Which given pose belongs to which frame."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Whether the images of a folder are of one camera, by all that their headers say."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

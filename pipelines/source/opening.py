@@ -1,7 +1,5 @@
 """The kinds of source, a video file, a folder of images or a data set, read alike."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Under which name, and whether unchanged, the file of an image can serve as a frame."""
 
-from __future__ import annotations
-
 import unicodedata
 from collections.abc import Sequence
 from pathlib import Path

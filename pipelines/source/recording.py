@@ -1,7 +1,5 @@
 """A data set as a source: images, times and camera as its reader gives them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sharpness of an image."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 
 import cv2

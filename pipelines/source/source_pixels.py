@@ -1,7 +1,5 @@
 """Which pixel of the source is behind a pixel of an undistorted frame."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

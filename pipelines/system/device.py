@@ -1,7 +1,5 @@
 """Device of dense work: decided here, by every process for itself."""
 
-from __future__ import annotations
-
 import functools
 import os
 import shutil

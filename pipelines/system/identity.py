@@ -10,8 +10,6 @@ changes no result of a stage keeps the users' runs; in any other state of the co
 Libraries are not part of it: another numpy or COLMAP may give other bytes, and does not make a run out of date.
 """
 
-from __future__ import annotations
-
 import ast
 import functools
 import hashlib

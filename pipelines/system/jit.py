@@ -1,7 +1,5 @@
 """Compiling kernels: how, and where the machine code is kept between runs. The one way to numba in this project."""
 
-from __future__ import annotations
-
 import functools
 import os
 import stat

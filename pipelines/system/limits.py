@@ -1,7 +1,5 @@
 """Limits that the system sets to this process: CPUs by affinity and by quotas of cgroups, and memory by cgroups."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Memory planning: what stages need according to past runs, and the size of the chunks that fit."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys

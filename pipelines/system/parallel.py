@@ -1,7 +1,5 @@
 """Work on threads side by side: what releases the interpreter lock overlaps with what does not."""
 
-from __future__ import annotations
-
 import itertools
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable, Iterator

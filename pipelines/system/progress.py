@@ -1,7 +1,5 @@
 """Progress of a stage, independent of who shows it."""
 
-from __future__ import annotations
-
 import logging
 import sys
 import time

@@ -1,7 +1,5 @@
 """Stopping softly: the first signal asks, and the work ends at the next moment at which nothing is lost."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from collections.abc import Callable, Iterator

@@ -1,8 +1,6 @@
 """Values as files for any machine, or for going on after an interruption: dataclasses of this program, arrays and plain
 values. Tasks and what they return are kept so, and the snapshots of the stages."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping

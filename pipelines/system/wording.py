@@ -1,7 +1,5 @@
 """Figures and numbers of frames in few words."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path

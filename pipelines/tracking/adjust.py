@@ -1,7 +1,5 @@
 """The adjustment of everything tracked: poses, points and the scale fields of the proxy depths, in turn."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any

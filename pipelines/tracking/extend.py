@@ -1,7 +1,5 @@
 """New keyframes where structure from motion has none: points from proxy depth, or triangulated from the last one."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

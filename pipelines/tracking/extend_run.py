@@ -1,7 +1,5 @@
 """A finished run becomes one of more videos: what it was is kept in it, and what follows starts from that."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

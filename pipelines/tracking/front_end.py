@@ -1,7 +1,5 @@
 """The front end: every frame that structure from motion left out is posed against the keyframes around it."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Grey images and features of frames, the last few kept in memory."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections import OrderedDict

@@ -1,7 +1,5 @@
 """The pose of a frame from pixels and points."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Finding a lost frame again among the keyframes: by how it looks, then by SIFT and PnP."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames that only turn: matches with a posed frame determine a rotation where they determine no depth."""
 
-from __future__ import annotations
-
 from itertools import groupby
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Joining stretches that began anew after a loss, when a keyframe of one is recognised in another."""
 
-from __future__ import annotations
-
 from collections import Counter
 from typing import Any
 

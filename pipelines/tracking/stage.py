@@ -1,7 +1,5 @@
 """Stage 3: a pose for every frame, metric where the proxy depth is, and the sparse points that hold them together."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from ...formats.errors import InputError

@@ -1,7 +1,5 @@
 """A flight through a map by keyframes: recorded in the viewer, kept as JSON, drawn by `render`."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ whoever looks at one (cross-site WebSocket hijacking), and under a name of its o
 could read the pages too (DNS rebinding). viser 1.1 checks neither.
 """
 
-from __future__ import annotations
-
 import functools
 import http
 import ipaddress

@@ -1,7 +1,5 @@
 """The viewer's tool for a camera path: keyframes at the current view, a preview of the flight, a file for `render`."""
 
-from __future__ import annotations
-
 import threading
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Watching a run that is not finished: what the viewer shows of it, what is still to come, and when there is more."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """The viewer's tools: which Gaussians are shown (classes, a box), what is saved of them, and a measuring tape."""
 
-from __future__ import annotations
-
 import tempfile
 import threading
 from collections.abc import Callable

@@ -5,8 +5,6 @@
 Stopped at any moment, the same command goes on where it was.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import re

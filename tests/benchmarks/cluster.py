@@ -11,8 +11,6 @@ is replaced at once. Needs msgs-slam[cluster].
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -10,8 +10,6 @@ was: DIR is for one state of the code and one choice of runs.
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -10,8 +10,6 @@ files. At the end one file of each stage is damaged and `resume` must bring back
 code 1 if any is wrong.
 """
 
-from __future__ import annotations
-
 import argparse
 import collections
 import hashlib

@@ -5,8 +5,6 @@ python tests/benchmarks/docs_pictures.py msgs-demo/room.msgs docs/pictures [--on
 Screenshots (report, viewer, page) need Chromium. --takes keeps the two videos of the page on filming that are refused.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import sys

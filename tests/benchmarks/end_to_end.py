@@ -5,8 +5,6 @@
 Needs the recordings in ../shared/data beside the repository. A sequence that is done in DIR is not done again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import subprocess

@@ -3,8 +3,6 @@
 python tests/benchmarks/first_picture.py RUN.msgs docs/pictures/wide.jpg [--frame 12]
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

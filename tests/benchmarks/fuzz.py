@@ -7,8 +7,6 @@ Prints a row for each reader; ends with 1 when a case ended in anything but acce
 those of `tests/damage`; Linux only (fork, limits).
 """
 
-from __future__ import annotations
-
 import argparse
 import collections
 import contextlib

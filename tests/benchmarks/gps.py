@@ -7,8 +7,6 @@ Every row: root mean square of the horizontal distance to the fixes, of a coordi
 wrong one), and how far the cameras moved from where the run's export has them.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

@@ -9,8 +9,6 @@ allocate while the function runs (tracemalloc). `power` is that of the count bet
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -10,8 +10,6 @@ without room and without rights, and sources that are exchanged while they are r
 was said; ends with 1 when anything was otherwise.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import ctypes

@@ -13,8 +13,6 @@ a resume that was killed too, and what differed. Figures of several seeds add up
 
 # ruff: noqa: E402 (the tests' world is found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import collections
 import json

@@ -12,8 +12,6 @@ taken from it, copies, and operations whose result's size depends on the values.
 
 # ruff: noqa: E402 (the paths are set, and Triton is told to interpret, before they are needed)
 
-from __future__ import annotations
-
 import os
 
 os.environ["TRITON_INTERPRET"] = "1"

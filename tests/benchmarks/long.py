@@ -14,8 +14,6 @@ be added to a table later.
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import json
 import resource

@@ -6,8 +6,6 @@
 640x480, 10 frames a second, noise of 1.5 grey levels, a little motion blur. 100 frames take 4 CPU minutes.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

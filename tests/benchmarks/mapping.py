@@ -11,8 +11,6 @@ Poses are the run's own; every eighth frame is held out of the map. Rows are (ca
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -10,8 +10,6 @@ frame is held out. No loops, no own poses, no triangulated points: `mapping.py` 
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

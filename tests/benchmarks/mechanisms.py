@@ -9,8 +9,6 @@ nothing there). Features and matches are made once and shared. ATE in centimetre
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -8,8 +8,6 @@ default pull are taken from FOLDER (../shared/data/models); classes are the netw
 are only regions.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

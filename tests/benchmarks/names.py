@@ -15,8 +15,6 @@ class that the network does not know is left out. The mesh is looked up at the s
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

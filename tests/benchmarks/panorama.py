@@ -7,8 +7,6 @@ ATE over the camera's places after Sim(3), and how much of the true surfaces tha
 mesh, or a solid Gaussian, within 5 cm: by whether it is seen level, upwards or downwards.
 """
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Recordings in parts: what nothing joins, what a loop joins, two videos of one place; each with its truth."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

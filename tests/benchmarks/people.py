@@ -15,8 +15,6 @@ farther than 30 cm from every surface of the 150 true depth maps. What of that t
 no trace of her.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -14,8 +14,6 @@ Behind each row stand the mapper and the mechanisms of `mechanisms.py` that acte
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

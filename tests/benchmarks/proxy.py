@@ -14,8 +14,6 @@ of both say that they show the same place.
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import json
 import shutil

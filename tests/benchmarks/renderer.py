@@ -9,8 +9,6 @@ Backends take turns, so that whatever else the machine does slows all of them: t
 
 # ruff: noqa: E402 (an environment variable must be set before torch is imported)
 
-from __future__ import annotations
-
 import os
 
 os.environ.setdefault(

@@ -13,8 +13,6 @@ order could have, in per cent. Kitchen's truth is of a camera 2.5 cm aside: its 
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -10,8 +10,6 @@ one shard: begun in random order, at most --beside at the same time, each second
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import json
 import random

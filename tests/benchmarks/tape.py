@@ -6,8 +6,6 @@ A place is a random pixel of a random keyframe: the tape looks along it from the
 same line from the true one. Lengths are compared after one scale for the whole run: the unit's own error is left out.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

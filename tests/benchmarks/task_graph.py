@@ -11,8 +11,6 @@ visits beside 9) and measured. Everything else stays in one process. Each kind o
 process.
 """
 
-from __future__ import annotations
-
 import argparse
 import heapq
 import json

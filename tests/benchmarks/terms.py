@@ -8,8 +8,6 @@ term off or on at a time. Labels: share of the pixels that the map labels as its
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

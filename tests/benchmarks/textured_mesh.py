@@ -6,8 +6,6 @@ dB over the pixels that both meshes cover, with each picture's exposure, mean ov
 that no mesh was made from. Drawn with four samples a pixel.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

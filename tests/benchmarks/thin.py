@@ -10,8 +10,6 @@ farther; "edges": within four pixels of a step of depth. A clip or run that is i
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

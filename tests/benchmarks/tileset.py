@@ -4,8 +4,6 @@ npm pack cesium @cesium/engine; tar xzf cesium-*.tgz
 python tests/benchmarks/tileset.py RUN/export/tiles package out.png [--tilt -25] [--away 1.2]
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import http.server

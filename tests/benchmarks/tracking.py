@@ -14,8 +14,6 @@ the rows of --json hold those of the clock too. Every row runs in a process of i
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
 
-from __future__ import annotations
-
 import argparse
 import json
 import multiprocessing

@@ -12,8 +12,6 @@ With a true depth as well, a row of its own says what the mesh could reach: accu
 true depth itself, each image put at the run's pose for it instead of the truth's, aligned as `evaluate` aligns meshes.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from dataclasses import replace

@@ -6,8 +6,6 @@ TRUTH is a data set with poses; x,y,z is up in its world (default: z). The floor
 the height, in the exported world, of the true surface at the bottom.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -1,7 +1,5 @@
 """Lengths of walls in a run's mesh beside those in surfaces made of true depth."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

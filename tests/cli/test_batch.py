@@ -1,7 +1,5 @@
 """`msgs-slam batch`: many recordings, one table, whatever becomes of single ones."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

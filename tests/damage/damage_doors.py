@@ -5,8 +5,6 @@ reader should have accepted: a value that is not finite, a matrix that is no rot
 outside the folder. A reader may refuse anything with InputError.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import shutil

@@ -4,8 +4,6 @@ Each mutator takes a file's bytes and a `random.Random` and returns other bytes.
 checksum or a parser, so there are mutators that know words, JSON and the inside of an archive.
 """
 
-from __future__ import annotations
-
 import gzip
 import io
 import json

@@ -1,7 +1,5 @@
 """A written file is whole or not there, and failures speak to the user."""
 
-from __future__ import annotations
-
 import errno
 import os
 import resource

@@ -1,7 +1,5 @@
 """COLMAP models: pycolmap reads what we write, and every digit of it comes back."""
 
-from __future__ import annotations
-
 import resource
 import shutil
 from pathlib import Path

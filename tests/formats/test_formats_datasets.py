@@ -1,7 +1,5 @@
 """Data set readers: on the real recordings depth, poses and intrinsics must agree with one another."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

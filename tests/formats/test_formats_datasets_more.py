@@ -1,7 +1,5 @@
 """Data sets that are not at hand: written here in their layouts from one known sequence, and read back."""
 
-from __future__ import annotations
-
 import json
 import re
 import struct

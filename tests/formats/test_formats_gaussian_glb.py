@@ -1,7 +1,5 @@
 """Gaussians in glTF: round trip in numbers, another program's reader, and files that are none."""
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Gaussian splat files: the reference layout to the byte, and foreign files."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Images of every kind a folder may hold, against OpenCV as the foreign reader and writer."""
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """Meshes: trimesh and plyfile read what we write, with colours and labels."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

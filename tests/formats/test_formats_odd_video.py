@@ -1,7 +1,5 @@
 """Videos whose frames are not simply shown as stored: interlaced, stretched, mirrored, raw, blank, damaged."""
 
-from __future__ import annotations
-
 import sys
 from fractions import Fraction
 from pathlib import Path

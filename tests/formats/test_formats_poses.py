@@ -1,7 +1,5 @@
 """Poses by other programs, in the layouts that these write."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """pycolmap's reconstruction as arrays."""
 
-from __future__ import annotations
-
 import numpy as np
 import pycolmap
 import pytest

@@ -1,7 +1,5 @@
 """SOG files, unpacked by the words of the specification."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

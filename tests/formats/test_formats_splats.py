@@ -1,7 +1,5 @@
 """SPZ, .splat and transforms.json, against files of other programs and against our own readers."""
 
-from __future__ import annotations
-
 import gzip
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Array files: nothing lost, nothing executed, the same bytes every time."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import subprocess

@@ -1,7 +1,5 @@
 """Trajectories survive the round trip, foreign files are read, and what is no pose is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Real, odd and broken videos; and the repair of time stamps against a known clock."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import struct

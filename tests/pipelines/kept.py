@@ -1,7 +1,5 @@
 """What `frames` keeps of correspondences, for runs whose frames are made up."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

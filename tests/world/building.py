@@ -5,8 +5,6 @@ turn, so that nobody sees further than two modules ahead or back: a picture need
 length of the walk. Light and pictures of a module depend on its number alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Ray casting against the solids of a world: compiled loops, the same bytes for any number of threads."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ What is hard for depth from pictures: the floor is even and is seen between legs
 and what lies under a desk is darker than what stands in the light.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

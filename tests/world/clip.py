@@ -1,7 +1,5 @@
 """A recording in a world: the camera, its walk, and what it gets wrong on purpose."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial

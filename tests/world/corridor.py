@@ -4,8 +4,6 @@ Doors and posters repeat every two metres with the very same pictures. What diff
 each, and the wear of the plaster and the floor.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from tests.world.build import Scene

@@ -1,7 +1,5 @@
 """Writes the clip that `msgs-slam demo` comes with: python -m tests.world.demo_clip"""
 
-from __future__ import annotations
-
 import tempfile
 import zipfile
 from pathlib import Path

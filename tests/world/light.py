@@ -1,7 +1,5 @@
 """Baked diffuse light: area lights with soft shadows and one bounce, on a coarse grid over every face."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

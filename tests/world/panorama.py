@@ -1,7 +1,5 @@
 """Panoramas of a world: every pixel's own rays, with exact truth."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

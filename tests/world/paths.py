@@ -1,7 +1,5 @@
 """Walks of a hand-held camera: smooth, closed, and never a turn on the spot."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

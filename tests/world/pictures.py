@@ -1,7 +1,5 @@
 """Procedural pictures of things: posters, book spines, a door, a view through a window, a cardboard box."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.random import Generator

@@ -1,7 +1,5 @@
 """A furnished living room, 6.4 x 5.2 x 2.7 m, round a table."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from tests.world.build import Scene

@@ -4,8 +4,6 @@ World axes: z up, metres, the floor at z = 0. A face is a rectangle of texture c
 as in an image, u to the right for somebody who looks at the outside of the solid.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

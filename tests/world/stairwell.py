@@ -4,8 +4,6 @@ What is hard for depth from pictures, and measured nowhere else: bars of a few p
 behind, gaps that a smooth surface would close, even walls, and a mirror image below the floor that matches very well.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

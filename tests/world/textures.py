@@ -3,8 +3,6 @@
 Every function returns linear albedo (h, w, 3) float32 in 0..1 for a face of `size` = (height, width) metres.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

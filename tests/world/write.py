@@ -1,7 +1,5 @@
 """A clip on disk: a sequence with its truth."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path

@@ -4,8 +4,6 @@ Pictures and volumes are flat, row by row; (BLOCK, TAPS) is a block of pixels by
 interpreter of Triton (environment variable TRITON_INTERPRET=1) runs these kernels on CPU tensors.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 

@@ -1,7 +1,5 @@
 """Do the depths of several views agree? Their support is the confidence, their mean the better depth."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ and they are mostly flat: at each pixel the plane through the sure depths that l
 the middle of them stands alone, so that how sure a depth is depends on how sure those around it are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

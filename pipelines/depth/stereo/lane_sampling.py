@@ -1,7 +1,5 @@
 """Operations on `lanes` that stereo alone needs: choices, and samples of an image between its pixels."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which views to match a keyframe with, and where to look for its depth: both from the sparse points."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -5,8 +5,6 @@ compared with those of its neighbours, which gives the fused depth and its confi
 and hold only a few frames at a time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Semi-global smoothing of a cost volume (Hirschmueller, PAMI 2008), eight directions."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

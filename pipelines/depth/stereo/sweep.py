@@ -8,8 +8,6 @@ follow the depth found so far, so slanted surfaces correlate as well as frontal 
 planes of the sweep.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Depth at the sweep's size brought to the size of the proxy maps, with its edges put where the image has them."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

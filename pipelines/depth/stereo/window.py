@@ -8,8 +8,6 @@ the texture of a wall that a thousandth of the weight still decides the correlat
 All that correlates is part of one kernel and takes sixteen pixels at once: rows lie in flat arrays, `row_length` apart.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """How far results of the card's kernels are from the references': renderer, mapping and stereo."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The whole job, a video to poses, map and mesh, on the card and on the CPU of the same machine."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

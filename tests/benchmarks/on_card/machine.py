@@ -1,7 +1,5 @@
 """The machine that figures are of."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import os
 import platform

@@ -1,7 +1,5 @@
 """gsplat's rasteriser beside this project's at equal Gaussians, sizes and features, where it is installed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The rows of `card.json` as tables of Markdown."""
 
-from __future__ import annotations
-
 from typing import Any
 
 Row = dict[str, Any]

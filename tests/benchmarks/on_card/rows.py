@@ -1,7 +1,5 @@
 """Rows of figures, written to one JSON file as they come: what ends a part early loses none of those before."""
 
-from __future__ import annotations
-
 import json
 import statistics
 import time

@@ -1,7 +1,5 @@
 """What the card's kernels take beside the CPU's, and how many launches and reads of the host there are."""
 
-from __future__ import annotations
-
 import json
 import tempfile
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Processes that share the tasks of a run over its folder: each task once, whoever is killed, in any order."""
 
-from __future__ import annotations
-
 import platform
 import resource
 import shutil

@@ -1,7 +1,5 @@
 """How many threads the libraries take."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import cv2

@@ -1,7 +1,5 @@
 """The ablations on the synthetic room: one set of proxies, a run a row and seed, resumable."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Lengths in the report against the truth of the made-up room, and in the words of the tape."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

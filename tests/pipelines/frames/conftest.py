@@ -1,7 +1,5 @@
 """A textured corner of a room with exact truth, seen by a camera with a lens."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache

@@ -1,7 +1,5 @@
 """Features and matches of made-up views round a table in a room of points, seen through any lens."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Corners are followed through keyframes whose features hold the path's size badly."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

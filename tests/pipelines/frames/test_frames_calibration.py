@@ -1,7 +1,5 @@
 """Intrinsics as users write them, and the lens made from them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Panoramas and fisheye pictures become pictures of a pinhole camera."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import replace
 from pathlib import Path

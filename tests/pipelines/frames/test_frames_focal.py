@@ -1,7 +1,5 @@
 """The focal length from pairs of views alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Poses by another program: a start, a yardstick, and what carries a path where the pictures say nothing."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Folders of images by one camera, or by several: what EXIF and the pixel formats say is compared and used."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Descriptors, verification, candidates: the parts of structure from motion on planted data."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

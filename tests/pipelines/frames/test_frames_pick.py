@@ -1,7 +1,5 @@
 """Picking by windows and sharpness."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Data sets as sources: what their readers know reaches the frames, the camera and the proxies."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Rolling shutter: found where there is one and only there, and poses that are right with it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Places where a path is torn are found, however good the rest is, and what they leave apart is cut."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

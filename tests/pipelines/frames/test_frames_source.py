@@ -1,7 +1,5 @@
 """Videos and folders of images as sources, the odd ones included."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The whole stage on a rendered walk: accuracy, bytes, going on after a kill, and what it refuses."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 from collections.abc import Callable, Iterable, Iterator

@@ -1,7 +1,5 @@
 """A camera that a data set states is held, whatever its lens, unless the pictures refute it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Things that repeat fold a path; what neighbours share unfolds it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

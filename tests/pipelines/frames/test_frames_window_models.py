@@ -1,7 +1,5 @@
 """What all windows of a long recording tell of the camera, and windows that do not become one model."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A long recording's windows, joined to one model."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A loop whose second half has grown by an eighth: closed, refining map and poses together keeps the depth right."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

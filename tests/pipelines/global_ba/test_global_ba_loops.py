@@ -1,7 +1,5 @@
 """Loops on a made-up walk round a room of points: found, closed, and not believed where they cannot be."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The stage from what the stages before it left: the map follows a closed loop, an interruption changes nothing."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Scenes for the renderer's tests and benchmark, and a compositing written a second time, pixel by Gaussian."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

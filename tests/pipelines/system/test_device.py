@@ -1,7 +1,5 @@
 """Who works with a map does so where it lies: on a device that is only pretended, but as strict as a GPU."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from pathlib import Path

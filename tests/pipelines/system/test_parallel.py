@@ -1,7 +1,5 @@
 """Work on threads side by side: in order, no more than asked for, and nothing made twice."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """A small room with exact truth, as a run whose frames and proxies are done; and a bundle of random points."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Poses by another program carry a path over what the pictures do not show, and make metres."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Six sides of a panorama are one camera: in the adjustment, and where a side sees nothing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
