@@ -79,7 +79,7 @@ def settings_page() -> str:
         parts.append("| --- | --- | --- | --- |")
         defaults = config_to_dict(values)
         for f in fields(values):
-            may_be = allowed_values(f) or _ANY[str(f.type)]
+            may_be = allowed_values(f) or _ANY[f.type.__name__]
             cells = (f"`{f.name}`", f"`{defaults[f.name]!r}`", may_be, f.metadata["help"])
             parts.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(parts) + "\n"

@@ -1,6 +1,7 @@
 """The door for files and paths from outside: what is opened, how much of it, and what its damage is called."""
 
 import errno
+import hashlib
 import os
 import posixpath
 import stat
@@ -179,3 +180,17 @@ def named_file(places: Sequence[Path], name: str, named_by: Path, shorten: bool 
         if found := next((file for file in files if file.is_file()), None):
             return found
     return None
+
+
+def file_sha256(path: Path) -> str:
+    """Hex SHA-256 of a file's bytes. Raises InputError when it cannot be read."""
+    with opened(path, any_content=True) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def files_sha256(named: Iterable[tuple[str, Path]], head: bytes = b"") -> str:
+    """Hex SHA-256 over `head` and the names and contents of files, wherever they are. Raises as `file_sha256`."""
+    digest = hashlib.sha256(head)
+    for name, path in named:
+        digest.update(f"{name}\0{file_sha256(path)}\n".encode("utf-8", "surrogateescape"))
+    return digest.hexdigest()

@@ -9,8 +9,7 @@ from typing import Any
 import click
 
 from .options import RUN_ARGUMENT, open_run
-from .output import Output, on_sigterm, verbosity_options
-from .text import say
+from .output import Output, on_sigterm, say, verbosity_options
 
 
 @click.command()
@@ -134,7 +133,7 @@ def render(
     An .mp4 is H.264 where PyAV is installed (pip install 'msgs-slam[hdr]'), else VP9: browsers play both. An .avi or
     .mkv loses nothing (FFV1).
     """
-    from ..pipelines.render_run import render_file, render_run
+    from ..pipelines.viewer.render_run import render_file, render_run
 
     is_file = source.is_file() and source.suffix.lower() in SPLAT_FILES
     if is_file and (kind != "color" or camera_path == "own"):

@@ -14,14 +14,12 @@ import click
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from ..formats.errors import InputError, SettingError
-from ..pipelines.run.names import EXPORTS, STAGES
+from ..pipelines.config import EXPORTS, STAGES
 from ..pipelines.system.wording import quoted
 from . import looking
-from .batch import batch
-from .doctor import doctor
-from .extending import extend
+from .batch import batch, work
 from .json_lines import Interrupted, is_asked_for, only_json
-from .models import models
+from .models import doctor, models
 from .options import (
     FOLDER,
     RUN_ARGUMENT,
@@ -35,10 +33,8 @@ from .options import (
     settings_options,
     source_options,
 )
-from .output import Output, on_sigterm, verbosity_options
-from .summary import print_summary, tell_run
-from .text import flush_output, prepare_streams, printable, say
-from .work import work
+from .output import Output, flush_output, on_sigterm, prepare_streams, printable, say, verbosity_options
+from .tables import print_summary, tell_run
 
 
 class FriendlyGroup(click.Group):
@@ -332,7 +328,6 @@ def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
 
 for command in (looking.status, looking.evaluate, looking.report, looking.render, looking.view):
     main.add_command(command)
-main.add_command(extend)
 main.add_command(models)
 main.add_command(batch)
 main.add_command(work)
@@ -340,3 +335,24 @@ main.add_command(doctor)
 
 if __name__ == "__main__":
     main()
+
+
+@main.command()
+@RUN_ARGUMENT
+@click.argument("videos", metavar="VIDEO...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@verbosity_options
+def extend(run_path: Path, videos: tuple[Path, ...], output: Output) -> None:
+    """Add VIDEO, by the same camera and of the same place, to the finished RUN.
+
+    First a few images of it are looked for in the run: where nothing is recognised, or the camera is another one, that
+    is said and nothing is changed. Then its frames join those of the run, whose poses are the start, all are adjusted
+    together, and the map is grown where the added frames look. Coordinates stay what they were, as near as the
+    adjustment allows. Stopped, the same command or `msgs-slam resume RUN` goes on.
+    """
+    from ..pipelines.reconstruct import extend as extend_run
+    from ..pipelines.run.folder import RunFolder
+
+    run = RunFolder(run_path)
+    with output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"):
+        records = extend_run(run, videos, output.progress())
+    tell_run(output, run.root, records)

@@ -1,11 +1,14 @@
-"""`msgs-slam models`: learned models in the cache."""
+"""`msgs-slam models` and `doctor`: learned models in the cache, and what is installed."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+
+from .output import say
 
 if TYPE_CHECKING:
     from ..pipelines.networks.registry import Model, ModelStore
@@ -135,3 +138,21 @@ def path(name: str) -> None:
     if not store.is_here(model):
         raise InputError(f"{name} is not in {store.cache}; run: msgs-slam models pull {name}")
     click.echo(str(store.path(model)))
+
+
+@click.command()
+def doctor() -> None:
+    """Say what this machine has for the program, a line each, with the fix where something is missing.
+
+    Exit code 1 where something would keep a reconstruction from running.
+    """
+    from ..pipelines.doctor import BAD, examine
+
+    findings = examine(Path("."))
+    width = max(len(f.name) for f in findings)
+    for f in findings:
+        say(f"{f.state:4}  {f.name:{width}}  {f.text}")
+        if f.fix:
+            say(f"{'':4}  {'':{width}}  fix: {f.fix}")
+    if any(f.state == BAD for f in findings):
+        sys.exit(1)

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ..pipelines.config import Option, settings_with_options
-from ..pipelines.run.names import STAGES
+from ..pipelines.config import STAGES, Option, settings_with_options
 
 if TYPE_CHECKING:
     from ..pipelines.config import Config

@@ -1,4 +1,4 @@
-"""Plain text tables of what a run did."""
+"""Plain text tables of a run, and the last words of a command that has brought one to its end."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import sys
 import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..pipelines.system.wording import figure_text
+from .output import Output, is_said, say
 
 if TYPE_CHECKING:
     from ..pipelines.run.manifest import StageRecord
@@ -76,3 +77,29 @@ def scale_lines(root: Path, records: dict[str, StageRecord]) -> list[str]:
 def warning_lines(records: dict[str, StageRecord], is_said: Callable[[str], bool] = lambda text: False) -> list[str]:
     """Every degraded result, by stage, that is not said yet."""
     return [f"warning ({n}): {text}" for n, record in records.items() for text in record.warnings if not is_said(text)]
+
+
+def tell_run(output: Output, root: Path, records: dict[str, Any]) -> None:
+    """Say how the run is now, for people unless they want errors only, and for programs."""
+    if not output.quiet:
+        print_summary(root, records)
+    output.tell_result(run=root, **({"export": root / "export"} if "export" in records else {}))
+
+
+def print_summary(root: Path, records: dict[str, Any]) -> None:
+    """Print the table, what is not said yet, and where the results are."""
+    from ..pipelines.reconstruct import all_stages
+    from ..pipelines.run.folder import RunFolder
+    from ..pipelines.status import DONE, StageStatus, about_new_networks
+
+    pass
+
+    say(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
+    for line in warning_lines(records, is_said):
+        say(line, err=True)
+    for line in scale_lines(root, records):
+        say(line)
+    if line := about_new_networks(RunFolder(root), all_stages()):
+        say(f"\n{line}")
+    if "export" in records:
+        say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")

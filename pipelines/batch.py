@@ -15,12 +15,11 @@ from ..formats.datasets import looks_like_recording
 from ..formats.errors import InputError
 from ..formats.images import VIDEO_SUFFIXES
 from ..formats.textfile import write_json
-from .config import Config
+from .config import STAGES, Config
 from .engine.placement import Command, Placement
 from .reconstruct import existing_config, reconstruct
 from .run.folder import RunFolder, load_records
 from .run.lock import RunBusyError
-from .run.names import STAGES
 from .system.progress import Progress, log
 from .system.wording import markdown_table
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from .system.device import unused_card
-from .system.limits import available_cpus
+from .system.memory import available_cpus
 
 GOOD, NOTE, BAD = "ok", "note", "BAD"
 DISTRIBUTION = "msgs-slam"

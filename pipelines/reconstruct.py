@@ -9,7 +9,7 @@ from ..formats.atomic import own_temporaries, temporary_of, write_text
 from ..formats.errors import InputError, RecoverableError
 from ..formats.reading import require_listable, require_unicode
 from ..formats.video import probe_video
-from .config import Config
+from .config import SOURCE_LIST, STAGES, Config
 from .engine.runner import run_stages
 from .engine.stages import Stage, TaskWorkers
 from .engine.tasks import BETWEEN_LOOKS, Shard, SharedWorkers, boards_in, set_threads
@@ -17,11 +17,10 @@ from .read_config import with_absolute_paths
 from .run.folder import RunFolder, load_records, load_settings, load_source
 from .run.lock import LEADER, LOCK, RunBusyError, locked, make_folder
 from .run.manifest import StageRecord, recorded_config
-from .run.names import SOURCE_LIST, STAGES
 from .run.running import NotedProgress
 from .source.opening import source_digest
 from .system.device import resolve_device
-from .system.limits import available_cpus
+from .system.memory import available_cpus
 from .system.progress import Progress, log
 from .system.stopping import stop_if_asked
 from .system.wording import quoted

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..formats.errors import InputError
-from .config import Config, ProxyConfig
+from .config import STAGES, Config, ProxyConfig
 from .engine.stages import Stage
 from .engine.staleness import changed_auto_choices, next_upstream, rerun_reason
 from .masks.people import people_cards
@@ -17,7 +17,6 @@ from .proxy.selection import choose_depth, choose_semantics
 from .run.files import CALIBRATION
 from .run.folder import RunFolder, load_records, load_settings, load_source
 from .run.manifest import StageRecord, differing_settings
-from .run.names import STAGES
 from .run.running import Running, load_running
 from .sfm.window_size import window_size, windows_of
 from .system.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size

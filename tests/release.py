@@ -11,7 +11,7 @@ import tomllib
 from pathlib import Path
 
 from msgs_slam.formats.atomic import write_text
-from msgs_slam.pipelines.run.names import STAGES
+from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.system.identity import ROOT, TABLE, source_digest
 
 PYPROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from . import gpu
-from .jit import kernel
-from .threads import for_each
+from .threads import for_each, kernel
 
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
 _ROWS = 8192

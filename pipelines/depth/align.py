@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ..geometry.posed_depth import PosedDepth, neighbours
 from ..geometry.sparse_model import SparseModel
-from ..system.lru_sequence import LruSequence
 from ..system.memory import ALIGNED_TOGETHER
+from ..system.parallel import LruSequence
 from ..types import Intrinsics, ProxyMaps
 from .fields import FINE, Basis, DepthFields, Equations, Grid, Prior, solve_fields
 

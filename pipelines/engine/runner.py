@@ -13,11 +13,10 @@ from typing import Any
 
 from ...formats.atomic import is_disk_full, remove_temporaries, write_text
 from ...formats.errors import DiskFullError, InputError, RecoverableError
-from ..config import Config
+from ..config import STAGES, Config
 from ..run.ending import FINGERPRINT, empty, find_sealed, move_in, results, seal, unseal
 from ..run.folder import RunFolder, load_records, save_settings
 from ..run.manifest import Manifest, Source, StageRecord, content_digest, plain, settings_of, write_manifest
-from ..run.names import STAGES
 from ..system.memory import release_free_memory
 from ..system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log
 from ..system.stopping import stop_if_asked

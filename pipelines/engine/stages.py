@@ -13,8 +13,7 @@ from ..config import Config
 from ..run.ending import SNAPSHOT
 from ..run.folder import RunFolder
 from ..system.device import resolve_device
-from ..system.limits import available_cpus
-from ..system.memory import memory_room, release_free_memory
+from ..system.memory import available_cpus, memory_room, release_free_memory
 from ..system.progress import Progress, log
 from ..system.stopping import stop_if_asked
 

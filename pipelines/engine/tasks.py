@@ -24,10 +24,9 @@ from typing import Any, TypeVar
 from ...formats.atomic import own_temporaries
 from ...formats.errors import InputError, RecoverableError
 from ...formats.textfile import read_json, write_json
-from ..config import Config
+from ..config import STAGES, Config
 from ..run.folder import RunFolder
 from ..run.lock import take_lock
-from ..run.names import STAGES
 from ..system.identity import stage_file, stage_identity
 from ..system.progress import Progress
 from ..system.stopping import stop_if_asked

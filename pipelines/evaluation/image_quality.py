@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...formats.digest import file_sha256
 from ...formats.errors import InputError
+from ...formats.reading import file_sha256
 from ..compute.ssim import TAPS, similarity
 from ..networks.registry import Model, ModelStore
 from ..networks.runtime import open_runtime

@@ -20,8 +20,7 @@ from ..geometry.posed_depth import PosedDepth
 from ..mapping.measure import DrawnView, Shown, drawn_view
 from ..outcome import Outcome, load_outcome, maps_around
 from ..scene.world import World
-from ..system.lru_sequence import LruSequence
-from ..system.parallel import abreast
+from ..system.parallel import LruSequence, abreast
 from ..system.progress import Progress
 from ..system.values import load_value, save_value
 from ..types import VOID

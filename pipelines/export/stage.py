@@ -7,9 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ...formats.digest import file_sha256
 from ...formats.gps import read_track
 from ...formats.mesh import mesh_blocks
+from ...formats.reading import file_sha256
 from ..config import Config, ExportConfig
 from ..engine.stages import Stage, StageContext
 from ..networks.registry import metric_card

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.sog import morton_codes
-from ..compute.jit import kernel
-from ..compute.threads import for_each, get_threads
+from ..compute.threads import for_each, get_threads, kernel
 from ..geometry.camera import unproject_depth
 from ..geometry.posed_depth import PosedDepth
 from ..geometry.voxels import cells_of, voxel_keys

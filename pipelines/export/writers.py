@@ -21,7 +21,7 @@ from ..geometry.sparse_model import SparseModel
 from ..outcome import Outcome, map_cloud
 from ..run.files import CLASSES, LEFT_OUT, METRES
 from ..scene.world import WORLD, World
-from ..system.lru_sequence import LruSequence
+from ..system.parallel import LruSequence
 from ..system.wording import stretches
 from .readme import lengths, licences, readme
 

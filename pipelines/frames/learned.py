@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.digest import file_sha256
 from ...formats.errors import InputError
+from ...formats.reading import file_sha256
 from ..config import FramesConfig
 from ..networks.registry import Model, ModelStore
 from ..networks.runtime import Runtime, open_runtime

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.digest import files_sha256
 from ...formats.errors import InputError
 from ...formats.image_folder import frame_number, natural_key
 from ...formats.images import image_size, read_rgb
+from ...formats.reading import files_sha256
 from ..config import Config
 from ..geometry.rig import ONE_CAMERA, Rig
 from ..masks.people import PeopleCards, PeopleFinder, people_cards

@@ -47,10 +47,9 @@ from ..source.sharpness import reduce_image
 from ..system.parallel import parallel_map
 from ..types import Calibration, Frame, GivenPoses
 from .findings import in_world_of, settled_origin, warn_of_focal, warn_of_given, warn_of_structure
-from .keyframes import KeyframeChoice, choose_keyframes
+from .keyframes import KeyframeChoice, choose_keyframes, pick_frames
 from .learned import learned_inputs, open_learned
 from .masks import FrameMasks, check_masks, mask_inputs
-from .picking import pick_frames
 from .priors import solve
 from .tasks import (
     TASKS,

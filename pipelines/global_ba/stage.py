@@ -31,7 +31,7 @@ from ..run.files import (
 from ..run.folder import RunFolder
 from ..sfm.bundle import reprojection_errors
 from ..sfm.retrieval import GlobalDescriptors, compute_global_descriptors, unit
-from ..system.lru_sequence import LruSequence
+from ..system.parallel import LruSequence
 from ..system.values import load_value, save_value
 from ..tracking.adjust import align_depths, without_dependent_depth
 from ..tracking.pictures import Pictures, load_shutter

@@ -18,7 +18,7 @@ from ..config import MappingConfig
 from ..render.api import Rendering
 from ..render.gaussian_map import GaussianMap
 from ..render.inspection import error_shares
-from ..system.lru_sequence import LruSequence
+from ..system.parallel import LruSequence
 from ..types import VOID, Intrinsics
 from .schedule import Seeding
 from .seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing

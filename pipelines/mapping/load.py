@@ -15,8 +15,8 @@ from ..engine.stages import StageContext
 from ..geometry.posed_depth import PosedDepth
 from ..run.files import CALIBRATION, DEPTH_FIELDS, FRAMES
 from ..run.folder import RunFolder
-from ..system.lru_sequence import LruSequence
 from ..system.memory import VIEWS_SHARE, room_on
+from ..system.parallel import LruSequence
 from ..types import Frame, Intrinsics, ProxyMaps, Trajectory
 from .views import View, make_view, occurring_classes
 

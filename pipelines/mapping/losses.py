@@ -8,10 +8,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..compute.jit import inner, kernel
 from ..compute.lanes import iota, load, splat, store, total, where
 from ..compute.ssim import C1, C2, blur_array, ssim_map
-from ..compute.threads import for_each
+from ..compute.threads import for_each, inner, kernel
 from .exposure import expose
 
 SSIM_WEIGHT = 0.2

@@ -16,8 +16,7 @@ from ..config import MappingConfig
 from ..render.api import Rendering, in_view, marked_in_view, render
 from ..render.gaussian_map import GaussianMap
 from ..render.inspection import blending_weights, class_weights
-from ..system.lru_sequence import LruSequence
-from ..system.parallel import abreast
+from ..system.parallel import LruSequence, abreast
 from ..system.progress import Progress, SilentProgress
 from ..system.stopping import is_asked
 from .exposure import SOLID, expose, fit_exposure

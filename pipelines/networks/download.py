@@ -21,8 +21,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ...formats.digest import file_sha256
 from ...formats.errors import DiskFullError, InputError
+from ...formats.reading import file_sha256
 from ..system.progress import log
 
 _CHUNK = 1 << 18

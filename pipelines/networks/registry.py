@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from ...formats.atomic import atomic_path
-from ...formats.digest import file_sha256
 from ...formats.errors import InputError
-from ...formats.reading import reaching, require_file
+from ...formats.reading import file_sha256, reaching, require_file
 from ...formats.textfile import read_json_object, write_json
 from .card import Card, card_from_values
 from .download import fetch

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.digest import file_sha256, files_sha256
 from ...formats.errors import InputError
+from ...formats.reading import file_sha256, files_sha256
 from .card import Card
 from .runtime import external_locations, is_tflite, open_runtime, require_own_weights
 from .words import LinearHead, WordHead, load_linear_head, load_word_head

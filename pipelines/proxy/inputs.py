@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from ...formats.digest import files_sha256
 from ...formats.errors import InputError
+from ...formats.reading import files_sha256
 from ..config import Config
 from ..depth.files import FilesDepth, require_sizes
 from ..labels.files import FilesLabels

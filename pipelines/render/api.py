@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..compute import gpu
-from ..compute.jit import kernel
-from ..compute.threads import PART, for_each
+from ..compute.threads import PART, for_each, kernel
 from ..geometry import se3
 from ..geometry.camera import project_gaussians
 from ..types import Intrinsics

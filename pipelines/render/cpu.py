@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..compute.jit import as_array
+from ..compute.threads import as_array
 from .cpu_backward import pull_back
 from .cpu_bands import split_into_bands
 from .cpu_forward import draw_bands, padded_channels

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compute.jit import inlined, inner, kernel
 from ..compute.lanes import add_totals, load, reciprocal, splat, store, where
-from ..compute.threads import PART, for_each
+from ..compute.threads import PART, for_each, inlined, inner, kernel
 from . import reference
 from .cpu_bands import PIXELS, RECORD, TILE, Bands, clear, for_each_band, row_opacity, walk_tiles
 from .cpu_forward import Vectors, vectors_for

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compute.jit import inner, kernel
 from ..compute.lanes import any_of, exp, iota, load, maximum, min_scalar, splat, store, where
-from ..compute.threads import PART, for_each
+from ..compute.threads import PART, for_each, inner, kernel
 from . import reference
 
 F32 = np.float32

@@ -5,8 +5,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compute.jit import inlined, inner, kernel
 from ..compute.lanes import add_to_box, load, store
+from ..compute.threads import inlined, inner, kernel
 from .cpu_bands import PIXELS, TILE, Bands, clear, for_each_band, row_opacity, walk_tiles
 
 F32 = np.float32

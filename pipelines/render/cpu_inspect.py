@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..compute.jit import inlined, inner, kernel
 from ..compute.lanes import load, maximum, reduce_max, splat, store, total, where
+from ..compute.threads import inlined, inner, kernel
 from .cpu_bands import PIXELS, TILE, Bands, clear, for_each_band, split_into_bands, walk_tiles
 from .cpu_forward import WEIGHTS, blend_rows, draw_bands
 

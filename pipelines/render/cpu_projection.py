@@ -7,8 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..compute.jit import as_array, inner, kernel
-from ..compute.threads import PART, for_each
+from ..compute.threads import PART, as_array, for_each, inner, kernel
 from ..types import Intrinsics
 
 

@@ -18,9 +18,8 @@ from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
-from ...formats.digest import file_sha256
 from ...formats.errors import InputError
-from ...formats.reading import parsing
+from ...formats.reading import file_sha256, parsing
 from ...formats.textfile import read_json_object, write_json
 from .folder import RunFolder
 from .manifest import StageRecord, content_digest

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.atomic import copy_file
-from ...formats.digest import file_sha256
 from ...formats.errors import InputError
+from ...formats.reading import file_sha256
 from ...formats.textfile import read_json_object, write_json
+from ..config import SOURCE_LIST
 from ..types import Calibration, Frame
 from .files import BACKBONE, CALIBRATION, EXPOSURE, FRAMES, MAP, TRAJECTORY
 from .folder import RunFolder, load_source
-from .names import SOURCE_LIST
 from .schema import RunFile, dataclass_from_json, reading
 
 if TYPE_CHECKING:

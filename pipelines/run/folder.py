@@ -19,18 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.atomic import write_text
-from ...formats.digest import file_sha256
 from ...formats.errors import InputError
 from ...formats.images import read_rgb
+from ...formats.reading import file_sha256
 from ...formats.textfile import read_toml
-from ..config import Config
+from ..config import EXTENSION, SOURCE_LIST, Config
 from ..read_config import UnknownSettingError, config_to_toml, merge_known_settings
 from ..system.progress import log
 from ..system.wording import quoted
 from ..types import Frame, ProxyMaps, any_of
 from .files import LEFT_OUT, PROXY_MAPS, SPARSE
 from .manifest import Manifest, Source, StageRecord, read_manifest, recorded_config
-from .names import EXTENSION, SOURCE_LIST
 from .schema import RunFile
 
 T = TypeVar("T")

@@ -11,10 +11,9 @@ from typing import Any
 from ...formats.errors import InputError
 from ...formats.reading import parsing
 from ...formats.textfile import read_json_object, write_json
-from ..config import Config, config_to_dict
+from ..config import STAGES, Config, config_to_dict
 from ..read_config import merge_known_settings
 from ..system.wording import quoted
-from .names import STAGES
 from .schema import dataclass_from_json
 
 FORMAT = 2

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.lru_sequence import LruSequence
+from ..system.parallel import LruSequence
 from ..types import Features
 from .flow import corners, follow
 from .matching import VerifiedPair

@@ -4,9 +4,8 @@ from pathlib import Path
 
 from ...formats.datasets.calibration import read_calibration_file
 from ...formats.datasets.sequence import Camera
-from ...formats.digest import file_sha256
 from ...formats.errors import InputError
-from ...formats.reading import home_expanded, reaching
+from ...formats.reading import file_sha256, home_expanded, reaching
 from ...formats.textfile import read_rows
 
 _HOW = "give fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file that holds them"

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..config import FramesConfig
 from ..geometry.rig import ONE_CAMERA
-from ..system.lru_sequence import LruSequence
+from ..system.parallel import LruSequence
 from ..system.progress import Progress
 from ..types import Features
 from .adjust import CAUCHY_PX, LOSS_SD, adjust, filter_outliers, solve

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ...formats.textfile import read_json, write_json
-from ..system.lru_sequence import LruSequence
 from ..system.memory import release_free_memory
-from ..system.parallel import parallel_map
+from ..system.parallel import LruSequence, parallel_map
 from ..system.progress import log
 from ..types import Features, Vocabulary
 from .adjust import adjust

@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.datasets.matching import SAME_INSTANT_SECONDS, poses_at
-from ...formats.digest import files_sha256
 from ...formats.errors import InputError
 from ...formats.image_folder import frame_number
 from ...formats.poses import PoseFile, read_poses, stem
-from ...formats.reading import home_expanded
+from ...formats.reading import files_sha256, home_expanded
 from ..config import FramesConfig
 from ..geometry import se3
 from ..types import Frame, GivenPoses

@@ -10,11 +10,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.digest import file_sha256, files_sha256
 from ...formats.errors import InputError
 from ...formats.image_folder import list_images, read_image_times, times_file
 from ...formats.images import Reading, is_depth_map, read_rgb, read_transparent
-from ...formats.reading import opened, reaching, require_file
+from ...formats.reading import file_sha256, files_sha256, opened, reaching, require_file
 from ...formats.textfile import read_text
 from ...formats.video import VideoFrame, VideoReader, probe_video
 from .one_camera import Headers, common_span, read_headers, require_one_lens

@@ -12,13 +12,12 @@ from ...formats.atomic import write_text
 from ...formats.errors import InputError
 from ...formats.reading import require_listable
 from ...formats.video import VideoFrame, probe_video
-from ..config import Config, FramesConfig
+from ..config import EXTENSION, SOURCE_LIST, STAGES, Config, FramesConfig
 from ..frames.learned import open_learned, picture_features
 from ..run.extension import FINAL, save_parent
 from ..run.files import CALIBRATION, SPARSE
 from ..run.folder import RunFolder, load_records, load_source
 from ..run.manifest import Manifest, Source, write_manifest
-from ..run.names import EXTENSION, SOURCE_LIST, STAGES
 from ..sfm.calibration import read_intrinsics
 from ..sfm.lens import Lens, calibrated_camera, make_lens, to_pycolmap
 from ..source.opening import VideoSource, open_source, source_digest, video_files

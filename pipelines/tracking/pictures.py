@@ -16,7 +16,7 @@ from ..run.folder import RunFolder
 from ..sfm.features import to_grey
 from ..sfm.retrieval import describe
 from ..sfm.rolling import Shutter
-from ..system.lru_sequence import LruSequence
+from ..system.parallel import LruSequence
 from ..types import Features, ProxyMaps
 
 T = TypeVar("T")

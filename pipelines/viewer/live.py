@@ -5,8 +5,8 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from ...formats.errors import InputError
+from ..config import STAGES
 from ..run.folder import RunFolder, load_records
-from ..run.names import STAGES
 from ..run.running import load_running
 from ..system.progress import log
 from ..system.wording import quoted

@@ -28,8 +28,8 @@ os.environ["PYTHONPATH"] = str(ROOT)  # of the nodes, as an installed program is
 os.environ["RAY_memory_monitor_refresh_ms"] = "0"  # noqa: SIM112  Ray writes it so
 os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112  with its 15 anything else starves the tasks
 
+from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.demo import unpack_demo_clip
-from msgs_slam.pipelines.run.names import STAGES
 from tests.benchmarks.shards import begin, beginning, contents, msgs_slam
 
 WITH_TASKS = {

@@ -24,10 +24,10 @@ import click
 import numpy as np
 from click.testing import CliRunner, Result
 
-from msgs_slam.formats.digest import file_sha256
+from msgs_slam.formats.reading import file_sha256
 from msgs_slam.msgs_cli.main import main as msgs_slam
+from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.viewer.server import Viewer
 
 PORT = 18097

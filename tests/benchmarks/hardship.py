@@ -318,7 +318,7 @@ def prepare(work: Path) -> None:
 
 def begin_all(work: Path, source: Path) -> dict[str, Path]:
     """Stage → a run of which everything before that stage is done."""
-    from msgs_slam.pipelines.run.names import STAGES
+    from msgs_slam.pipelines.config import STAGES
 
     whole, begun = work / "whole.msgs", {}
     shutil.rmtree(whole, ignore_errors=True)

@@ -32,14 +32,13 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from msgs_slam.formats.digest import file_sha256
+from msgs_slam.formats.reading import file_sha256
 from msgs_slam.formats.textfile import read_json_object, write_json
 from msgs_slam.formats.video_writer import write_video
-from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.config import STAGES, Config
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import all_stages, reconstruct, resume
 from msgs_slam.pipelines.run.folder import RunFolder, load_settings
-from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.system.identity import stage_identity
 from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.world import ClipOptions, iter_clip, make_world

@@ -31,10 +31,10 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.formats.video_writer import write_video
+from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.run.files import BACKBONE, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.names import STAGES
 from tests.world import ClipOptions, write_sequence
 from tests.world.building import Walk, around, frames
 

@@ -38,7 +38,7 @@ from msgs_slam.pipelines.mapping.load import without_contradicted_depth
 from msgs_slam.pipelines.mapping.optimise import optimise_map
 from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes
 from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.system.lru_sequence import LruSequence
+from msgs_slam.pipelines.system.parallel import LruSequence
 from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 
 

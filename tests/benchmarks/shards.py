@@ -22,9 +22,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from msgs_slam.formats.digest import file_sha256
+from msgs_slam.formats.reading import file_sha256
+from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.demo import unpack_demo_clip
-from msgs_slam.pipelines.run.names import STAGES
 
 SETTINGS = (
     "run.threads=1", "frames.rate=4", "frames.max_features=600", "proxy.stereo_side=96", "proxy.stereo_planes=24",

@@ -221,9 +221,9 @@ def run_stages_timed(
     source: Path, run: Any, config: Any, until: str
 ) -> tuple[dict[str, Any], dict[str, dict[str, float]]]:
     """The stages' records, and what each took; of a stage that is up to date, what it took when it ran."""
+    from msgs_slam.pipelines.config import STAGES
     from msgs_slam.pipelines.reconstruct import reconstruct
     from msgs_slam.pipelines.run.folder import load_records
-    from msgs_slam.pipelines.run.names import STAGES
     from msgs_slam.pipelines.system.progress import SilentProgress
 
     stored = run.root.with_suffix(".seconds.json")

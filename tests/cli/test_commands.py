@@ -13,11 +13,10 @@ from click.testing import CliRunner, Result
 from msgs_slam.formats.atomic import temporary_of
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.msgs_cli.main import KindOfFile, main
-from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.config import EXPORTS, Config
 from msgs_slam.pipelines.reconstruct import existing_config
 from msgs_slam.pipelines.run.folder import RunFolder, save_settings
 from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
-from msgs_slam.pipelines.run.names import EXPORTS
 
 
 def invoke(*arguments: object) -> Result:

@@ -14,12 +14,12 @@ from cli_runs import OPTIONS, QUICK, elsewhere, files_below, invoke
 from test_kill_and_resume import digests, finish, kill_when, start, written
 
 from msgs_slam.formats.video_writer import write_video
+from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.geometry.se3 import align_points, inverse
 from msgs_slam.pipelines.run.files import MAP, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings, load_source
 from msgs_slam.pipelines.run.lock import locked
 from msgs_slam.pipelines.run.manifest import read_manifest, write_manifest
-from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.tracking.extend_run import add_videos, is_added
 from tests.world import iter_clip, make_world
 

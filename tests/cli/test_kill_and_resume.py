@@ -15,7 +15,7 @@ from pathlib import Path
 
 from cli_runs import QUICK, FinishedRun, elsewhere, files_below
 
-from msgs_slam.pipelines.run.names import STAGES
+from msgs_slam.pipelines.config import STAGES
 
 COMPARED = ("frames", "proxy", "tracking", "mapping", "global_ba", "export")
 

@@ -4,9 +4,9 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.run import files
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
-from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.run.schema import RunFile
 
 ROWS: list[RunFile] = [*files.FIGURES.values(), *(row for row in vars(files).values() if isinstance(row, RunFile))]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from cli_runs import invoke
 
-from msgs_slam.formats.digest import file_sha256
+from msgs_slam.formats.reading import file_sha256
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
 
 DIVIDED = ("--set", "mapping.submap=5", "--until", "mapping", "-q")

@@ -20,8 +20,8 @@ import pytest
 import trimesh
 
 import msgs_slam
+from msgs_slam.pipelines.config import EXPORTS, STAGES
 from msgs_slam.pipelines.engine.tasks import TASK_MODULES
-from msgs_slam.pipelines.run.names import EXPORTS, STAGES
 
 PROGRAM = Path(sys.executable).with_name("msgs-slam")
 PACKAGE = Path(importlib.import_module("msgs_slam.pipelines").__file__ or "").parents[1]

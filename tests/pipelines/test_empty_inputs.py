@@ -47,12 +47,12 @@ from msgs_slam.pipelines.mapping.seeding import complete_depth, fill_smoothly, s
 from msgs_slam.pipelines.mapping.submaps import nearest_seeing
 from msgs_slam.pipelines.mapping.views import halved, make_view, occurring_classes
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
-from msgs_slam.pipelines.render_run import orbit, resampled, smoothed
 from msgs_slam.pipelines.scene.gps import georeference
 from msgs_slam.pipelines.scene.metres import Seen, contradiction, usual_evidence
 from msgs_slam.pipelines.scene.upright import cameras_up, line_planes, up_of_lines
 from msgs_slam.pipelines.scene.view import SeenFrame, build_scene
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
+from msgs_slam.pipelines.viewer.render_run import orbit, resampled, smoothed
 
 UP = np.array([0.0, -1, 0])
 EYE = np.eye(4)

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compute.jit import inner, kernel
 from ...compute.lanes import any_of, exp, iota, load, maximum, min_scalar, splat, store, where
+from ...compute.threads import inner, kernel
 from .lane_sampling import choose, corners, smallest
 from .volume import Bands
 

@@ -5,8 +5,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compute.jit import inner, kernel
 from ...compute.lanes import load, splat, store
+from ...compute.threads import inner, kernel
 from .lane_sampling import smallest, smallest_of
 from .volume import BLOCK, TILE, UNREACHED, Bands, Volume, pixel_of_tile
 

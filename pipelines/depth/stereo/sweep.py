@@ -11,8 +11,8 @@ planes of the sweep.
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compute.jit import inner, kernel
 from ...compute.lanes import splat, store
+from ...compute.threads import inner, kernel
 from .lane_sampling import with_row_below
 from .volume import BLOCK, TILE, UNREACHED, Bands, Volume, pixel_of_tile, tiles_of
 from .window import (

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compute.jit import inner
+from ...compute.threads import inner
 from ...system.jit import kernel
 
 TILE = BAND_ROWS = 16

@@ -11,8 +11,8 @@ All that correlates is part of one kernel and takes sixteen pixels at once: rows
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compute.jit import inner, kernel
 from ...compute.lanes import exp, iota, load, maximum, min_scalar, splat, store, where
+from ...compute.threads import inner, kernel
 from .lane_sampling import choose, interpolate, smallest, square_root
 from .volume import BAND_ROWS
 

@@ -16,7 +16,7 @@ from ...geometry.camera import project
 from ...geometry.posed_depth import PosedDepth
 from ...outcome import Outcome
 from ...system.jit import kernel
-from ...system.lru_sequence import LruSequence
+from ...system.parallel import LruSequence
 from ...system.progress import Progress
 from ...types import Frame, Intrinsics
 from .atlas import Atlas, owners, simplified, unwrapped

@@ -12,13 +12,12 @@ import pytest
 
 from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.errors import DiskFullError
-from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.config import STAGES, Config
 from msgs_slam.pipelines.engine.runner import run_stages
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.ending import RECORD, discard, empty, find_sealed
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
-from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 CALLS = ("replace", "rename", "unlink", "rmdir", "mkdir", "fsync", "open")

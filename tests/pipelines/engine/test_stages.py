@@ -8,12 +8,11 @@ import pytest
 
 from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.errors import DiskFullError, InputError
-from msgs_slam.pipelines.config import Config, MappingConfig
+from msgs_slam.pipelines.config import STAGES, Config, MappingConfig
 from msgs_slam.pipelines.engine.runner import run_stages
 from msgs_slam.pipelines.engine.stages import SameSource, Stage, StageContext
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
-from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 

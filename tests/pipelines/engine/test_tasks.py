@@ -18,13 +18,12 @@ import pytest
 
 from msgs_slam.formats import atomic
 from msgs_slam.formats.errors import InputError, RecoverableError
-from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.config import STAGES, Config
 from msgs_slam.pipelines.engine import tasks
 from msgs_slam.pipelines.engine.runner import run_stages
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.engine.tasks import Shard, SharedWorkers, TaskBoard, boards_in, in_chunks
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.system import values
 from msgs_slam.pipelines.system.progress import SilentProgress
 

@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.pipelines.render_run import orbit, resampled, smoothed
 from msgs_slam.pipelines.scene.upright import cameras_up
+from msgs_slam.pipelines.viewer.render_run import orbit, resampled, smoothed
 from tests.world import make_world, walk
 
 

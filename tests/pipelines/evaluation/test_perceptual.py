@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from msgs_slam.formats.datasets import Sequence
-from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.reading import file_sha256
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.evaluation.image_quality import Lpips, open_lpips
 from msgs_slam.pipelines.evaluation.write import evaluation_table

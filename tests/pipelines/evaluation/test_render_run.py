@@ -18,10 +18,10 @@ from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.demo import TRUTH, VIDEO, demo_summary, run_demo, unpack_demo_clip
 from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.render_run import film_seconds, render_run
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
 from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
 from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.viewer.render_run import film_seconds, render_run
 from tests.world import make_world, render_frame
 from tests.world.demo_clip import OPTIONS, pack_clip
 
@@ -70,7 +70,9 @@ def test_the_length_of_a_film_is_said_first(
     run = oracle_run()
     outcome, told = load_outcome(run), list[str]()
     walk = replace(outcome.trajectory, timestamps=np.arange(32) * 300.0)
-    monkeypatch.setattr("msgs_slam.pipelines.render_run.load_outcome", lambda _: replace(outcome, trajectory=walk))
+    monkeypatch.setattr(
+        "msgs_slam.pipelines.viewer.render_run.load_outcome", lambda _: replace(outcome, trajectory=walk)
+    )
     folder = render_run(run, tmp_path / "film", path="own", fps=0.2, size=(24, 18), tell=told.append)
     assert len(list_images(folder)) == 6  # of 31 seconds, not of 9,300
     assert told == ["rendering 6 images: a film of 30 s at 0.2 images a second"]

@@ -16,9 +16,9 @@ from msgs_slam.formats.ply import write_gaussian_ply
 from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.evaluation.views import SplatScene, draw_splats, render_outcome
 from msgs_slam.pipelines.outcome import load_outcome, map_cloud
-from msgs_slam.pipelines.render_run import render_file
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Intrinsics
+from msgs_slam.pipelines.viewer.render_run import render_file
 
 CAMERA = Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0)
 

@@ -13,11 +13,11 @@ from finished import note_finished
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gaussians import isotropic_cloud
 from msgs_slam.formats.ply import write_gaussian_ply
+from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.files import BACKBONE, FRAMES, MAP, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import locked
-from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.run.running import NotedProgress
 from msgs_slam.pipelines.system.progress import BEGUN, SilentProgress, StageEvent
 from msgs_slam.pipelines.viewer import live

@@ -19,10 +19,10 @@ from msgs_slam.formats.images import read_rgb
 from msgs_slam.formats.ply import write_gaussian_ply
 from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.geometry.se3 import Similarity
-from msgs_slam.pipelines.render_run import render_file, render_run
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import WORLD, World
 from msgs_slam.pipelines.viewer.camera_path import EXPORTED, RUN, CameraPath, Keyframe, read_camera_path
+from msgs_slam.pipelines.viewer.render_run import render_file, render_run
 from tests.browser import BROWSER, browser
 
 OracleRun = Callable[..., RunFolder]

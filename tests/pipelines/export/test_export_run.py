@@ -16,7 +16,7 @@ from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gaussian_glb import read_gaussian_glb
 from msgs_slam.formats.spz import read_spz
-from msgs_slam.pipelines.config import ExportConfig
+from msgs_slam.pipelines.config import EXPORTS, ExportConfig
 from msgs_slam.pipelines.export.extra import texture as textured
 from msgs_slam.pipelines.export.readme import licences
 from msgs_slam.pipelines.export.stage import export_run
@@ -24,7 +24,6 @@ from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.files import FRAMES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.names import EXPORTS
 from msgs_slam.pipelines.scene.world import WORLD
 from msgs_slam.pipelines.types import Metres
 

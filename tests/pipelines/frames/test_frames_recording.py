@@ -16,7 +16,7 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
-from msgs_slam.pipelines.frames.picking import pick_frames
+from msgs_slam.pipelines.frames.keyframes import pick_frames
 from msgs_slam.pipelines.frames.tasks import known_camera
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.providers import Sequence as ProxySequence

@@ -13,7 +13,7 @@ from msgs_slam.pipelines.sfm.driver import StructureFromMotion
 from msgs_slam.pipelines.sfm.lens import unknown_camera
 from msgs_slam.pipelines.sfm.matching import VerifiedPair, verify_matches
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
-from msgs_slam.pipelines.system.lru_sequence import LruSequence
+from msgs_slam.pipelines.system.parallel import LruSequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Features
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msgs_slam.formats.digest import file_sha256
 from msgs_slam.formats.errors import DiskFullError, InputError
+from msgs_slam.formats.reading import file_sha256
 from msgs_slam.pipelines.networks.download import fetch
 from msgs_slam.pipelines.networks.registry import Model, ModelStore
 

@@ -9,12 +9,11 @@ import pytest
 
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines import reconstruct
-from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.config import STAGES, Config
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.run import ending, running
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import is_led, locked
-from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.run.running import FILE, Running, load_running
 from msgs_slam.pipelines.status import run_status
 from msgs_slam.pipelines.system.progress import SilentProgress

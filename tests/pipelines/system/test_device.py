@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from msgs_slam.formats.datasets import open_sequence
-from msgs_slam.pipelines.config import Config, ExportConfig, GlobalBaConfig, MappingConfig, ProxyConfig
+from msgs_slam.pipelines.config import STAGES, Config, ExportConfig, GlobalBaConfig, MappingConfig, ProxyConfig
 from msgs_slam.pipelines.engine.runner import run_stages
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
@@ -21,11 +21,10 @@ from msgs_slam.pipelines.mapping.state import MapParameters, empty_map
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
-from msgs_slam.pipelines.render_run import render_run
 from msgs_slam.pipelines.run.files import MAP, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.viewer.render_run import render_run
 from msgs_slam.pipelines.viewer.scene import load_scenes
 from tests.pipelines.mapping.small_run import make_run
 from tests.pretend_device import DEVICE, PretendTensor, WrongDeviceError, pretended

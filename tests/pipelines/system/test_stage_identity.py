@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.reconstruct import all_stages
-from msgs_slam.pipelines.run.names import STAGES
 from msgs_slam.pipelines.system.identity import ROOT, TABLE, source_digest, stage_identity, stage_sources
 
 REPOSITORY = Path(__file__).resolve().parents[3]

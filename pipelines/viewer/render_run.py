@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from ..formats.errors import InputError
-from ..formats.gaussian_files import read_gaussians
-from ..formats.images import write_rgb
-from ..formats.video_writer import CODECS, PLAYED, write_browser_video, write_video
-from .evaluation.views import (
+from ...formats.errors import InputError
+from ...formats.gaussian_files import read_gaussians
+from ...formats.images import write_rgb
+from ...formats.video_writer import CODECS, PLAYED, write_browser_video, write_video
+from ..evaluation.views import (
     Picture,
     SplatScene,
     depth_picture,
@@ -23,14 +23,14 @@ from .evaluation.views import (
     label_picture,
     render_outcome,
 )
-from .outcome import Outcome, load_outcome
-from .run.folder import RunFolder
-from .scene.world import WORLD, up_in_run
-from .system.progress import Progress, SilentProgress, log
-from .system.wording import quoted
-from .types import Intrinsics
-from .viewer.camera_path import EXPORTED, CameraPath, read_camera_path
-from .viewer.scene import up_of_file
+from ..outcome import Outcome, load_outcome
+from ..run.folder import RunFolder
+from ..scene.world import WORLD, up_in_run
+from ..system.progress import Progress, SilentProgress, log
+from ..system.wording import quoted
+from ..types import Intrinsics
+from .camera_path import EXPORTED, CameraPath, read_camera_path
+from .scene import up_of_file
 
 Array = NDArray[np.float64]
 
