@@ -250,6 +250,6 @@ def test_files_stay_readable(path: Path) -> None:
     for node in ast.walk(ast.parse("\n".join(lines))):
         if isinstance(node, ast.FunctionDef):
             # A compiled kernel is one nest of loops: what it calls would have to be compiled and inlined with it.
-            most = 110 if any(ast.unparse(d) == "kernel" for d in node.decorator_list) else 80
+            most = 110 if any(ast.unparse(d) == "kernel" for d in node.decorator_list) else 60
             length = (node.end_lineno or 0) - node.lineno
-            assert length < most, f"{node.name} is {length} lines"
+            assert length <= most, f"{node.name} is {length} lines"
