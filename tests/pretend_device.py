@@ -19,7 +19,7 @@ from torch.utils._pytree import tree_flatten, tree_map
 from msgs_slam.pipelines import outcome
 from msgs_slam.pipelines.engine import stages
 from msgs_slam.pipelines.mapping import submap_tasks
-from msgs_slam.pipelines.render import api, cpu, inspection, reference
+from msgs_slam.pipelines.render import api, cpu, inspection
 
 DEVICE = "meta"
 _COPIES = {torch.ops.aten.copy_.default, torch.ops.aten._to_copy.default}
@@ -155,9 +155,7 @@ class _Composite(torch.autograd.Function):
     def forward(ctx: Any, rest: tuple[Any, ...], *values: PretendTensor) -> tuple[torch.Tensor, ...]:
         ctx.inputs = [v.inner.detach().contiguous().requires_grad_() for v in values]
         with torch.enable_grad():
-            # The card's kernels have gradients of any number of features, the CPU's of colours alone.
-            kernels = cpu if ctx.inputs[5].shape[1] == cpu.COLORS else reference
-            ctx.outputs = kernels.composite(*ctx.inputs, *rest)
+            ctx.outputs = cpu.composite(*ctx.inputs, *rest)
         return tuple(PretendTensor(x.detach()) for x in ctx.outputs)
 
     @staticmethod

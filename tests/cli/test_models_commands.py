@@ -83,7 +83,7 @@ def test_files_of_a_folder_are_taken_by_their_content(cache: Path, tmp_path: Pat
     (tmp_path / "empty").mkdir()
     nothing = models("pull", "--from", tmp_path / "empty")
     assert nothing.exit_code == 1
-    assert "holds no file of metric3d-large" in nothing.stderr
+    assert "holds no file of metric3d-small, moge2-s" in nothing.stderr
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "whatever.bin").write_bytes(
         (shared_data / "models" / "selfie_segmentation.tflite").read_bytes()

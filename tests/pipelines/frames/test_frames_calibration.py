@@ -319,7 +319,7 @@ def test_a_plausible_prior_focal_length_that_contradicts_the_images_is_dropped_a
 def test_a_prior_focal_length_that_the_images_agree_with_is_kept(
     bent_walk: Walk, make_context: Callable[..., StageContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(FolderSource, "exif_focal", lambda _: 1.1 * bent_walk.focal)
+    monkeypatch.setattr(FolderSource, "exif_focal", lambda _: 1.03 * bent_walk.focal)
     context = make_context(bent_walk.folder)
     assert run(context)["calibration"] == "exif"
     assert not [w for w in context.warnings if "contradicts the images" in w]

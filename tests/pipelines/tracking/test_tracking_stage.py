@@ -252,7 +252,7 @@ def test_nothing_to_go_by_is_refused(
     tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
 ) -> None:
     made = make_run(tmp_path / "run", keyframes=())
-    with pytest.raises(InputError, match="parallax"):
+    with pytest.raises(InputError, match="Possible causes: a camera that stands still or only turns"):
         STAGE.run(open_stage(made.run, "tracking", Config()))
 
 
