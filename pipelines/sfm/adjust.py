@@ -167,10 +167,8 @@ def _lens_covariance(model: pycolmap.Reconstruction, adjuster: pycolmap.CeresBun
 def focals_of_halves(model: pycolmap.Reconstruction) -> list[tuple[float, float]]:
     """Return the focal length and its standard deviation, in pixels, that the first and the second half of the views
     tell, each adjusted by itself with the lens's distortion as it is; of few views what all of them tell."""
-    images = sorted(model.reg_image_ids())
-    middle = len(images) // 2 if len(images) >= _MIN_KEYFRAMES_TO_SPLIT else len(images)
-    halves, found = (images[:middle][:_SPLIT_VIEWS], images[middle:][-_SPLIT_VIEWS:]), []
-    for half in filter(None, halves):
+    found = []
+    for half in _halves(sorted(model.reg_image_ids())):
         part = _part(model, half)
         solve(part, half, refine_camera=True, bend_lens=False, roughly=True)
         covariance = _lens_covariance(part, solve(part, half, refine_camera=True, bend_lens=False))
@@ -179,11 +177,19 @@ def focals_of_halves(model: pycolmap.Reconstruction) -> list[tuple[float, float]
 
 
 def _difference_of_halves(model: pycolmap.Reconstruction, images: Sequence[int], bend_lens: bool) -> float:
-    if len(images) < _MIN_KEYFRAMES_TO_SPLIT:
+    halves = _halves(images)
+    if len(halves) < 2:
         return 0.0
+    first, second = (_focal_of(model, half, bend_lens) for half in halves)
+    return abs(first - second)
+
+
+def _halves(images: Sequence[int]) -> list[Sequence[int]]:
+    """The first and the last views, at most `_SPLIT_VIEWS` each; few views are not split."""
+    if len(images) < _MIN_KEYFRAMES_TO_SPLIT:
+        return [images]
     middle = len(images) // 2
-    first, second = images[:middle][:_SPLIT_VIEWS], images[middle:][-_SPLIT_VIEWS:]
-    return abs(_focal_of(model, first, bend_lens) - _focal_of(model, second, bend_lens))
+    return [images[:middle][:_SPLIT_VIEWS], images[middle:][-_SPLIT_VIEWS:]]
 
 
 def _focal_of(model: pycolmap.Reconstruction, images: Sequence[int], bend_lens: bool) -> float:
