@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ...formats.gaussians import GaussianCloud
 from ..outcome import Exposure, Outcome, labels_of_channels
+from ..providers import class_colors
 from ..render.api import render
 from ..render.gaussian_map import GaussianMap, decided_channels
 from ..render.inspection import median_depth
@@ -159,10 +160,9 @@ def _titles(titles: Sequence[str], width: int) -> Picture:
 def class_colors_by_name(
     names: Sequence[str], colors: Sequence[tuple[int, int, int] | None], table: ClassTable
 ) -> list[tuple[int, int, int]]:
-    """Display colours of the truth's classes: the run's for the same name, else the truth's own, else a grey."""
+    """Display colours of the truth's classes: the run's for the same name, else the truth's own, else by the name."""
     known = {n.lower(): c for n, c in zip(table.names, table.colors, strict=True)}
-    greys = [(60 + 37 * i % 160,) * 3 for i in range(len(names))]
-    return [known.get(n.lower(), c or (g[0], g[1], g[2])) for n, c, g in zip(names, colors, greys, strict=True)]
+    return [known.get(n.lower(), c or own) for n, c, own in zip(names, colors, class_colors(names), strict=True)]
 
 
 @dataclass(frozen=True)

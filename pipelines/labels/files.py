@@ -67,7 +67,7 @@ class FilesLabels(SemanticsProvider):
         # 0 is the usual id of "nothing" in tables that do not name it.
         self._outside = {i: int(counts[i]) for i in occurring if i not in table and i not in (0, VOID, MAX_ID)}
         self._label_of[kept] = np.arange(len(kept), dtype=np.uint8)
-        colors = class_colors(len(kept))
+        colors = class_colors(table[i].name for i in kept)
         self._classes = ClassTable(
             tuple(table[i].name for i in kept), tuple(table[i].color or colors[k] for k, i in enumerate(kept))
         )

@@ -35,9 +35,9 @@ class OnnxLabels(SemanticsProvider):
 
     shared_state: tuple[str, ...] = ("_label_of", "_scene")
 
-    def __init__(self, card: Card, place: Workplace, most: int) -> None:
-        """Opens the network; `most` numbered objects of what has no name. Raises InputError when the network cannot be
-        what the card says."""
+    def __init__(self, card: Card, place: Workplace, most: int, no_people: bool = False) -> None:
+        """Opens the network; `most` numbered objects of what has no name; `no_people`: nothing is called a person.
+        Raises InputError when the network cannot be what the card says."""
         if card.task != "segmentation":
             raise InputError(
                 f"{card.model}: its card says {card.task}, but proxy.semantics needs a segmentation network"
@@ -46,6 +46,7 @@ class OnnxLabels(SemanticsProvider):
         self._sequence = place.sequence
         self.name = card.name
         self._names, self._void = card.labels, card.void
+        self._people = [i for i, name in enumerate(card.labels) if no_people and name == "person"]
         self._most = most
         self._progress = place.progress
         self._classes = ClassTable((), ())
@@ -75,11 +76,7 @@ class OnnxLabels(SemanticsProvider):
             names = tuple(self._names[i] for i in kept)
         if not 0 < len(names) < VOID:
             raise InputError(f"{self.name}: {len(names)} classes occur; 1 to {VOID - 1} are needed. Check the card")
-        # By the place in the network's own list: a name has the same colour in every video.
-        colors = class_colors(len(self._names) + len(names))
-        self._classes = ClassTable(
-            names, tuple(colors[i if i >= 0 else len(self._names) + n] for n, i in enumerate(kept))
-        )
+        self._classes = ClassTable(names, class_colors(names))
 
     def _has_world(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> bool:
         """Whether two frames or more with a pose have depth that can be relied on."""
@@ -114,7 +111,9 @@ class OnnxLabels(SemanticsProvider):
         """(rows, columns, C) over the whole image; 0 where the network says nothing."""
         neg_log2_prob = self._pass.load(frame)["halvings"]
         said = np.exp2(-neg_log2_prob.astype(np.float32) / np.float32(_STEPS))
-        return np.where(neg_log2_prob.min(-1, keepdims=True) < 255, said, 0).astype(np.float32)
+        said = np.where(neg_log2_prob.min(-1, keepdims=True) < 255, said, 0).astype(np.float32)
+        said[..., self._people] = 0
+        return said
 
     def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
         """Return labels fused over all frames that see the same places; without a world, this frame's alone."""

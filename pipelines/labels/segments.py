@@ -114,7 +114,7 @@ class SegmentLabels(SemanticsProvider):
             names.append("other")
         label[kind == OTHER] = own
         self._label = label
-        self._classes = ClassTable(tuple(names), class_colors(len(names)))
+        self._classes = ClassTable(tuple(names), class_colors(names))
 
     def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
         """Votes of the voxels under the pixels, spread along like colours to where the depth is unsure."""

@@ -89,7 +89,8 @@ class RecordingLabels(_RecordingMaps, SemanticsProvider):
         if not kept:
             raise InputError(f"{self._recording.root}: the label images hold no class at all, only void")
         self._label_of[kept] = np.arange(len(kept), dtype=np.uint8)
-        chosen, colors = [self._recording.classes[i] for i in kept], class_colors(len(kept))
+        chosen = [self._recording.classes[i] for i in kept]
+        colors = class_colors(c.name for c in chosen)
         self._classes = ClassTable(
             tuple(c.name for c in chosen), tuple(c.color or colors[k] for k, c in enumerate(chosen))
         )

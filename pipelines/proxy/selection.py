@@ -36,7 +36,7 @@ _FILES_LOOKED_AT = 12
 class ProviderContext:
     """Inputs of every provider. `scratch(name)` is a folder that exists as long as the stage is unfinished; `recording`
     is the source's data set, None for a video or plain images; results of networks are kept over runs in `cache_mb`
-    megabytes."""
+    megabytes. People are left out of a frame, so that no place is one, where `no_people`."""
 
     source: Path
     sequence: Sequence
@@ -47,6 +47,7 @@ class ProviderContext:
     progress: Progress
     recording: Recording | None = None
     cache_mb: int = 0
+    no_people: bool = False
 
 
 def split_choice(text: str, setting: str, kinds: tuple[str, ...]) -> tuple[str, str]:
@@ -150,7 +151,7 @@ def open_learned_semantics(around: ProviderContext, choice: Choice) -> FilesLabe
     place = _workplace(around, "network_labels")
     if choice.card.is_clustered:
         return OnnxClusters(choice.card, place, around.config.max_classes)
-    return OnnxLabels(choice.card, place, around.config.max_classes)
+    return OnnxLabels(choice.card, place, around.config.max_classes, around.no_people)
 
 
 def open_depth_files(around: ProviderContext, folder: str) -> FilesDepth | RecordingDepth:

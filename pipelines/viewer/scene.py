@@ -21,11 +21,11 @@ from ..geometry.sparse_model import SparseModel
 from ..outcome import Outcome, evenly, labels_of_channels, load_outcome, map_cloud
 from ..providers import class_colors
 from ..render.gaussian_map import decided_channels
-from ..run.files import BACKBONE, CALIBRATION, FRAMES, MESH
+from ..run.files import BACKBONE, CALIBRATION, CLASSES, FRAMES, MESH
 from ..run.folder import RunFolder, load_records
 from ..scene.upright import cameras_up
 from ..scene.world import WORLD, up_in_run
-from ..types import Frame, Intrinsics, Metres
+from ..types import ClassTable, Frame, Intrinsics, Metres
 from .camera_path import EXPORTED, RUN
 
 Array = NDArray[np.float64]
@@ -219,15 +219,18 @@ def _from_file(path: Path) -> ViewerScene:
     cloud = read_gaussians(path)
     if len(cloud) == 0:
         raise InputError(f"{path}: holds no Gaussians")
-    classes = 0 if cloud.class_ids is None else int(cloud.class_ids.max()) + 1
+    count = 0 if cloud.class_ids is None else int(cloud.class_ids.max()) + 1
+    names = tuple(f"class {i}" for i in range(count))
+    known = CLASSES.read(beside) if (beside := path.with_name(CLASSES.name)).is_file() else ClassTable((), ())
+    table = known if len(known) >= count else ClassTable(names, class_colors(names))
     return ViewerScene(
         title=path.name,
         cloud=cloud,
         scale=_scale(cloud.means, np.zeros((0, 3))),
         up=up_of_file(path),
         labels=cloud.class_ids,
-        class_names=tuple(f"class {i}" for i in range(classes)),
-        class_colors=class_colors(classes),
+        class_names=table.names,
+        class_colors=table.colors,
     )
 
 

@@ -199,7 +199,7 @@ def write_sheet(labelled: Labelled, truth: Sequence | None, target: Path) -> Non
         image = outcome.run.image(outcome.frames[outcome.frame_row(frame_id)])
         cells = [image, *(_named(v, labelled.names, colors) for v in labelled.kinds(frame_id).values())]
         if frame_id in true_of and truth is not None:
-            spread = class_colors(len(truth.classes))
+            spread = class_colors(truth.class_names)
             true_colors = [c.color or s for c, s in zip(truth.classes, spread, strict=True)]
             cells.append(_named(true_of[frame_id], truth.class_names, true_colors))
         rows.append(np.hstack([cv2.resize(c, (360, round(360 * c.shape[0] / c.shape[1]))) for c in cells]))

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from proxy_room import Room
+from skimage.color import deltaE_ciede2000, rgb2lab
 from test_proxy_names import depth_of
 from tiny_tflite import write_tflite
 
@@ -19,7 +20,7 @@ from msgs_slam.pipelines.networks.card import Card
 from msgs_slam.pipelines.networks.network_pass import ResultCache, Workplace
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.networks.session import Network
-from msgs_slam.pipelines.providers import DepthEstimate, Sequence
+from msgs_slam.pipelines.providers import _COMMON, DepthEstimate, Sequence, class_colors
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics
 from tests.network_labels import network_labels
@@ -29,10 +30,19 @@ KINDS = ("wall", "floor", "furniture")
 COLOURS = np.array([(255, 0, 0), (0, 255, 0), (0, 0, 255)], np.uint8)
 
 
-def provider(card: Card, sequence: Sequence, folder: Path) -> OnnxLabels:
+CONES = (
+    ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    ((0.152286, 1.052583, -0.204868), (0.114503, 0.786281, 0.099216), (-0.003882, -0.048116, 1.051998)),
+    ((0.367322, 0.860646, -0.227968), (0.280085, 0.672501, 0.047413), (-0.011820, 0.042940, 0.968881)),
+    ((1.255528, -0.076749, -0.178779), (-0.078411, 0.930809, 0.147602), (0.004733, 0.691367, 0.303900)),
+)
+"""Linear RGB as seen with all cones, and without the long, middle and short ones (Machado et al. 2009)."""
+
+
+def provider(card: Card, sequence: Sequence, folder: Path, no_people: bool = False) -> OnnxLabels:
     folder.mkdir()
     cache = ResultCache(folder / "cache", 0)
-    return OnnxLabels(card, Workplace(sequence, lambda: folder, 1, "cpu", SilentProgress(), cache), 16)
+    return OnnxLabels(card, Workplace(sequence, lambda: folder, 1, "cpu", SilentProgress(), cache), 16, no_people)
 
 
 def alone(card: Card, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -79,6 +89,41 @@ def test_frames_of_a_stand_in_name_the_made_room_together(room: Room, tmp_path: 
     assert single is not None
     assert together is not None
     assert 0.5 < single.mean_iou + 0.1 < together.mean_iou < 0.999
+
+
+def test_nothing_is_called_a_person_where_people_are_left_out(room: Room, tmp_path: Path) -> None:
+    weight = [[8.0, -4.0, -4.0], [-4.0, 8.0, -4.0], [-4.0, -4.0, 8.0]]
+    file = write_tflite(tmp_path / "net.tflite", weight, [0, 0, 0], "argmax", (96, 128))
+    card = Card(
+        "segmentation", file, "image", "scores", 1.0, (0.5,) * 3, (0.5,) * 3, kind="logits",
+        classes=("wall", "floor", "person"),
+    )  # fmt: skip
+    picture = np.full((192, 256, 3), COLOURS[2], np.uint8)
+    picture[:64] = COLOURS[0]
+    sequence = replace(room.sequence(), read_image=lambda frame: picture)
+    for no_people in (False, True):
+        found = provider(card, sequence, tmp_path / f"work {no_people}", no_people)
+        found.fit(room.frames, lambda f: depth_of(room, f))
+        assert "person" in found.figures()["vocabulary"]
+        assert len(found.classes()) > 1
+        assert ("person" in found.classes().names) != no_people
+
+
+def test_a_name_has_one_colour_that_all_eyes_tell_apart() -> None:
+    common = tuple(alike.split()[0] for alike in _COMMON.values())
+    colors = np.array(class_colors((*common, "object 1", "object 2", "other")), float) / 255
+    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    for eye in CONES:
+        seen = (linear @ np.array(eye).T).clip(0, 1)
+        lab = rgb2lab(np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055))
+        apart = deltaE_ciede2000(lab[:, None], lab[None])[: len(common)]
+        assert apart[apart > 1e-9].min() > 10
+    # By the name alone, whatever stands beside it; what has none is grey, and numbered classes are not
+    assert class_colors(["Coffee_table ", "wall"])[0] == class_colors(["coffee table"])[0]
+    assert all(len(set(color)) == 1 for color in class_colors(["object 1", "object 14", "other", "unknown"]))
+    many = class_colors(alike for line in _COMMON.values() for alike in line.split())
+    assert len(set(many)) == len(many)
+    assert all(len(set(color)) > 1 for color in (*many, *class_colors(["class 3", "cluster 1", "zebra crossing"])))
 
 
 def test_frames_of_the_real_network_name_a_room_better_together(shared_data: Path, tmp_path: Path) -> None:
