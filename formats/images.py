@@ -224,15 +224,6 @@ def read_header(path: Path) -> Header:
         return Header(stored, _orientation(image) if before == 1 else before, lens, deep, images)
 
 
-def exif_focal_px(path: Path, width: int, height: int) -> float | None:
-    """Return the focal length in pixels of an image of width x height, from EXIF; None when EXIF states none.
-
-    From the 35 mm equivalent (over the diagonal, as the makers define it for other aspect ratios than 3:2), else
-    from the focal length and the sensor's pixel pitch. The image may have been resized since, but not cropped.
-    """
-    return read_header(path).lens.focal_px(width, height)
-
-
 def exif_time(path: Path) -> float | None:
     """Return the seconds (of the camera's own clock, since 1970) when the image was taken, from EXIF; None when
     missing."""

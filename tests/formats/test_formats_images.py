@@ -18,19 +18,23 @@ from msgs_slam.formats.exif import ExifLens, lens_of, place_of
 from msgs_slam.formats.image_folder import frame_number, list_images, natural_key, read_image_times
 from msgs_slam.formats.images import (
     decode_rgb,
-    exif_focal_px,
     exif_gps,
     exif_time,
     image_size,
     is_plain,
     read_depth_png,
     read_grey_png,
+    read_header,
     read_label_png,
     read_rgb,
     read_transparent,
     write_grey_png,
     write_rgb,
 )
+
+
+def _focal_px(path: Path, width: int, height: int) -> float | None:
+    return read_header(path).lens.focal_px(width, height)
 
 
 @pytest.fixture
@@ -184,7 +188,7 @@ def test_heic_tells_focal_length_time_and_place(tmp_path: Path, picture: np.ndar
     Image.fromarray(picture).save(tmp_path / "IMG_1.HEIC", exif=exif)
     path = tmp_path / "IMG_1.HEIC"
     assert list_images(tmp_path) == [path]
-    assert exif_focal_px(path, 6000, 4000) == pytest.approx(26 * 6000 / 36, rel=1e-6)
+    assert _focal_px(path, 6000, 4000) == pytest.approx(26 * 6000 / 36, rel=1e-6)
     assert exif_time(path) == (datetime(2024, 5, 6, 7, 8, 9) - datetime(1970, 1, 1)).total_seconds()
     assert exif_gps(path) == pytest.approx((-10.5, 20.26, 120.5))
     path.rename(tmp_path / "IMG_1.jpg")  # phones' programs send them under that name
@@ -290,29 +294,29 @@ def _with_exif(path: Path, size: tuple[int, int], **tags: object) -> Path:
 def test_exif_focal_from_the_35_mm_equivalent(tmp_path: Path) -> None:
     path = _with_exif(tmp_path / "a.jpg", (400, 300), equivalent=26)
     # a 4:3 picture whose diagonal of 500 px stands for 43.27 mm
-    assert exif_focal_px(path, 400, 300) == pytest.approx(26 / 43.2666 * 500, rel=1e-4)
-    assert exif_focal_px(path, 200, 150) == pytest.approx(26 / 43.2666 * 250, rel=1e-4)
+    assert _focal_px(path, 400, 300) == pytest.approx(26 / 43.2666 * 500, rel=1e-4)
+    assert _focal_px(path, 200, 150) == pytest.approx(26 / 43.2666 * 250, rel=1e-4)
 
 
 def test_exif_focal_from_the_pixel_pitch(tmp_path: Path) -> None:
     # 4000 px over 20 mm = 200 px/mm = 5080 px/inch; 10 mm = 2000 px of the original, 1000 px at half size
     path = _with_exif(tmp_path / "a.jpg", (400, 300), focal=10.0, pitch=5080.0, unit=2, width=4000)
-    assert exif_focal_px(path, 2000, 1500) == pytest.approx(1000)
+    assert _focal_px(path, 2000, 1500) == pytest.approx(1000)
     nonsense = _with_exif(tmp_path / "b.jpg", (400, 300), focal=10.0, pitch=72.0, unit=2, width=4000)
-    assert exif_focal_px(nonsense, 2000, 1500) is None
+    assert _focal_px(nonsense, 2000, 1500) is None
 
 
 def test_exif_that_tells_nothing(tmp_path: Path) -> None:
-    assert exif_focal_px(_with_exif(tmp_path / "a.jpg", (40, 30)), 40, 30) is None
-    assert exif_focal_px(_with_exif(tmp_path / "b.jpg", (40, 30), equivalent=0), 40, 30) is None
+    assert _focal_px(_with_exif(tmp_path / "a.jpg", (40, 30)), 40, 30) is None
+    assert _focal_px(_with_exif(tmp_path / "b.jpg", (40, 30), equivalent=0), 40, 30) is None
     assert exif_time(_with_exif(tmp_path / "c.jpg", (40, 30), taken="    :  :     :  :  ")) is None
 
 
 @pytest.mark.parametrize("equivalent", [1, 6, 1300, 65535])
 def test_an_impossible_35_mm_equivalent_is_ignored(tmp_path: Path, equivalent: int) -> None:
-    assert exif_focal_px(_with_exif(tmp_path / "a.jpg", (400, 300), equivalent=equivalent), 400, 300) is None
+    assert _focal_px(_with_exif(tmp_path / "a.jpg", (400, 300), equivalent=equivalent), 400, 300) is None
     path = _with_exif(tmp_path / "b.jpg", (400, 300), equivalent=equivalent, focal=10.0, pitch=5080.0, width=4000)
-    assert exif_focal_px(path, 2000, 1500) == pytest.approx(1000)
+    assert _focal_px(path, 2000, 1500) == pytest.approx(1000)
 
 
 def test_malformed_exif_costs_what_it_says_and_not_the_image(tmp_path: Path, picture: np.ndarray) -> None:
@@ -332,7 +336,7 @@ def test_malformed_exif_costs_what_it_says_and_not_the_image(tmp_path: Path, pic
     Image.fromarray(picture).save(tmp_path / "b.jpg", exif=b"Exif\0\0no TIFF header at all")
     for name in ("a.jpg", "b.jpg"):
         assert read_rgb(tmp_path / name).size == picture.size
-        assert (exif_focal_px(tmp_path / name, 40, 30), exif_gps(tmp_path / name)) == (None, None)
+        assert (_focal_px(tmp_path / name, 40, 30), exif_gps(tmp_path / name)) == (None, None)
 
 
 def test_exif_time_with_fractions(tmp_path: Path) -> None:
@@ -342,7 +346,7 @@ def test_exif_time_with_fractions(tmp_path: Path) -> None:
 
 def test_real_phone_photos_agree_with_their_reconstruction(shared_data: Path) -> None:
     for path in list_images(shared_data / "format_cases" / "colmap_table10" / "images")[:3]:
-        assert exif_focal_px(path, *image_size(path)) is None  # the messenger removed it
+        assert _focal_px(path, *image_size(path)) is None  # the messenger removed it
     assert [p.name for p in list_images(shared_data / "format_cases" / "colmap_table10" / "images")][
         -1
     ] == "10table.jpeg"
