@@ -31,9 +31,9 @@ def man_page() -> str:
 
 def commands(group: click.Group, name: str) -> Iterator[str]:
     """A section for each command, and for those below it."""
-    for key in group.list_commands(click.Context(group)):
+    for key in group.list_commands(context_of(group)):
         command = group.commands[key]
-        usage = " ".join(command.collect_usage_pieces(click.Context(command)))
+        usage = " ".join(command.collect_usage_pieces(context_of(command)))
         yield f".SH {roff(f'{name} {key}'.upper())}"
         yield from [
             f".B {roff(f'{name} {key}')}",
@@ -47,10 +47,15 @@ def commands(group: click.Group, name: str) -> Iterator[str]:
 
 def options(command: click.Command) -> Iterator[str]:
     """An entry for each option."""
-    for parameter in command.get_params(click.Context(command)):
-        record = parameter.get_help_record(click.Context(command))
+    for parameter in command.get_params(context_of(command)):
+        record = parameter.get_help_record(context_of(command))
         if record and record[1]:
             yield from [".TP", f".B {roff(record[0])}", roff(record[1])]
+
+
+def context_of(command: click.Command) -> click.Context:
+    """A context as on the command line: `-h` is another name of `--help`, of every command."""
+    return click.Context(command, **main.context_settings)
 
 
 def paragraphs(text: str) -> Iterator[str]:

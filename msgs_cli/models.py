@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from ..pipelines.system.wording import BAD, Finding
 from .output import say
 
 if TYPE_CHECKING:
@@ -127,6 +129,35 @@ def verify() -> None:
 
 
 @models.command()
+@click.argument("names", nargs=-1, metavar="[NAME|CARD]...")
+def check(names: tuple[str, ...]) -> None:
+    """Run the installed networks, or those named or described by a CARD.toml, on a built-in image of known depth.
+
+    Compares input, outputs, sizes, units and ranges of values with what the card says; exit code 1 where it is wrong.
+    """
+    from ..formats.errors import InputError
+    from ..pipelines.demo import known_view
+    from ..pipelines.networks.card import read_card
+    from ..pipelines.networks.check import check_network
+    from ..pipelines.networks.registry import ModelStore
+
+    store = ModelStore.open()
+    own = {name: read_card(Path(name)) for name in names if Path(name).suffix.lower() in (".toml", ".json")}
+    chosen = [store.get(name) for name in names if name not in own]
+    with_card = [m for m in chosen or ([] if own else store.models) if "input" in store.families[m.family]]
+    cards = own | {m.name: store.card(m) for m in with_card if chosen or store.is_here(m)}
+    if not cards:
+        raise InputError(f"no network with a card is in {store.cache}; run: msgs-slam models pull")
+    view = known_view()
+    found = {name: check_network(card, view) for name, card in cards.items()}
+    for name, findings in found.items():
+        say(f"{name}: {cards[name].model}")
+        _tell(findings)
+    if any(f.state == BAD for findings in found.values() for f in findings):
+        sys.exit(1)
+
+
+@models.command()
 @click.argument("name")
 def path(name: str) -> None:
     """Print the path of a model's file."""
@@ -146,13 +177,18 @@ def doctor() -> None:
 
     Exit code 1 where something would keep a reconstruction from running.
     """
-    from ..pipelines.doctor import BAD, examine
+    from ..pipelines.doctor import examine
 
     findings = examine(Path("."))
+    _tell(findings)
+    if any(f.state == BAD for f in findings):
+        sys.exit(1)
+
+
+def _tell(findings: Sequence[Finding]) -> None:
+    """A line for each finding, another for what to do."""
     width = max(len(f.name) for f in findings)
     for f in findings:
         say(f"{f.state:4}  {f.name:{width}}  {f.text}")
         if f.fix:
             say(f"{'':4}  {'':{width}}  fix: {f.fix}")
-    if any(f.state == BAD for f in findings):
-        sys.exit(1)

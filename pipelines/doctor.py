@@ -9,31 +9,20 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from .system.device import unused_card
 from .system.memory import available_cpus
+from .system.wording import BAD, GOOD, NOTE, Finding
 
-GOOD, NOTE, BAD = "ok", "note", "BAD"
 DISTRIBUTION = "msgs-slam"
 _MODULES = (
     "torch", "cv2", "pycolmap", "numba", "onnxruntime", "scipy", "skimage", "PIL", "trimesh", "plyfile", "safetensors"
 )  # fmt: skip
 _LEAST_MEMORY, _LEAST_DISK = 4.0, 3.0
 """Gigabytes: the largest run of the benchmarks peaks at 1.8 and fills 0.5."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line of the examination; `fix` says what to type or change, "" where nothing needs to be."""
-
-    name: str
-    state: str
-    text: str
-    fix: str = ""
 
 
 def examine(folder: Path) -> list[Finding]:

@@ -168,7 +168,7 @@ def test_commands_of_the_docs_are_understood(line: str, tmp_path: Path, monkeypa
             _, found, words = command.resolve_command(context, words)
             assert found is not None
             command = found
-    command.make_context(command.name, words)
+        command.make_context(command.name, words, parent=context)
 
 
 def messages() -> Iterator[str]:
