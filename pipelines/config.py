@@ -256,6 +256,15 @@ class GlobalBaConfig:
     use_loops: bool = setting(True, "look for places that are seen again")
     use_semantics: bool = setting(True, "propose loops by semantics too, eqs. (21) to (24)")
     joint: str = setting("moved", "refine map and poses together", ("moved", "always", "never"))
+    posed: str = setting(
+        "every", "every: the images of the source between the picked frames get a pose too; picked: those frames alone",
+        ("every", "picked"),
+        option=Option(
+            "pose-frames",
+            help="Give a pose to every image of a video, those between the picked frames too, or to the picked ones "
+            "(frames.rate a second) alone. Default: every.",
+        ),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from .run.files import (
     CALIBRATION,
     CLASS_IDS,
     CLASSES,
+    EVERY_FRAME,
     EXPOSURE,
     FIGURES,
     FRAMES,
@@ -77,7 +78,7 @@ class Outcome:
     is done; label_of_channel (C,) takes a class channel of the map to its label. `metric`: whether the world's unit is
     the metre of the proxy depth. vocabulary: the classes that the network which labelled it knows, () without one.
     `move`: how all of it has been moved out of the run's own world. `metres`: how long the unit is, as far as the
-    export could tell."""
+    export could tell. `every`: poses of all images of the source, see EVERY_FRAME; None where only frames have one."""
 
     run: RunFolder
     records: Mapping[str, StageRecord]
@@ -96,6 +97,7 @@ class Outcome:
     vocabulary: tuple[str, ...]
     move: Similarity | None = None
     metres: Metres | None = None
+    every: Trajectory | None = None
 
     @property
     def source_is_folder(self) -> bool:
@@ -122,12 +124,10 @@ class Outcome:
         """Transform cameras, map and points into another world. Raises ValueError where that has been done before."""
         if self.move is not None:
             raise ValueError("this outcome is no longer in the run's own world")
-        poses = other_from_run.apply_to_poses(self.trajectory.cam_from_world)
-        # A lost frame keeps its identity: it has no position.
-        poses = np.where(self.trajectory.is_posed[:, None, None], poses, self.trajectory.cam_from_world)
         return replace(
             self,
-            trajectory=replace(self.trajectory, cam_from_world=poses),
+            trajectory=self.trajectory.moved(other_from_run.apply_to_poses),
+            every=None if self.every is None else self.every.moved(other_from_run.apply_to_poses),
             gaussian_map=None if self.gaussian_map is None else self.gaussian_map.moved(other_from_run),
             move=other_from_run,
         )
@@ -171,6 +171,7 @@ def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
         semantics=str(report.get("semantics", "")),
         vocabulary=tuple(map(str, report.get("vocabulary", ()))),
         metres=run.find(METRES) if "export" in records else None,
+        every=run.find(EVERY_FRAME) if pose_stage == "global_ba" else None,
     )
 
 

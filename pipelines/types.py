@@ -11,7 +11,7 @@ Conventions
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -257,6 +257,11 @@ class Trajectory:
     def centers(self) -> NDArray[np.float64]:
         """(N, 3) camera centres in the world."""
         return self.world_from_cam[:, :3, 3]
+
+    def moved(self, move: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Trajectory:
+        """Change the poses (N, 4, 4) by a function; lost frames keep their identity, for they have no position."""
+        poses = np.where(self.is_posed[:, None, None], move(self.cam_from_world), self.cam_from_world)
+        return replace(self, cam_from_world=poses)
 
 
 @dataclass(frozen=True)

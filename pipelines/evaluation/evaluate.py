@@ -17,11 +17,12 @@ from ..outcome import Outcome, evenly
 from ..render.api import Rendering, render
 from ..source.source_pixels import FramePixels
 from ..system.progress import Progress, SilentProgress
+from ..types import Trajectory
 from .image_quality import DepthErrorSum, open_lpips, psnr, ssim
 from .labels import ClassMap, Counts, Matching, count_labels, label_cells, match_classes
 from .mesh_error import mesh_cells
 from .trajectory_error import AbsoluteError, ErrorStatistics, absolute_error, relative_error
-from .truth import MatchedTruth, match_truth
+from .truth import MatchedTruth, match_by_time, match_truth
 from .views import MapView, render_outcome
 
 KEYFRAMES, BETWEEN, HELD_OUT = "keyframes", "between", "held out"
@@ -34,8 +35,9 @@ In a room of noise 0.02, from 1 cm and 0.3 degrees: within 0.15 mm of the true p
 
 PROTOCOL = (
     "Frames belong to the truth of the same {by}; the other frames count as picked and posed only.",
-    "ATE: distance of camera centres after one alignment (Umeyama) over the frames it is given for; Sim(3) finds the "
-    "scale, SE(3) does not.",
+    "ATE: distance of camera centres after one alignment (Umeyama) over the frames it is given for: all picked ones, "
+    "the keyframes, or every image of the source, those between too; Sim(3) finds the scale, SE(3) does "
+    "not.",
     "RPE: motion from one frame with truth to the next, at the scale of Sim(3).",
     "PSNR and SSIM (Gaussian window 11, sigma 1.5) of 8-bit images of the frames' full size, with the exposure that "
     "the run found; mean over views; LPIPS on AlexNet where the extra is installed. Refined poses are those from which "
@@ -97,8 +99,9 @@ def evaluate_outcome(
 
 def frame_cells(outcome: Outcome, matched: MatchedTruth) -> dict[str, Any]:
     """Count the frames of each kind."""
-    t = outcome.trajectory
-    return {
+    t, every = outcome.trajectory, outcome.every
+    images = {} if every is None else {"images": len(every.frame_ids), "images posed": int(every.is_posed.sum())}
+    return images | {
         "picked": len(t.frame_ids),
         "posed": int(t.is_posed.sum()),
         "by rotation alone": int(t.by_rotation.sum()),
@@ -131,9 +134,11 @@ def trajectory_cells(outcome: Outcome, matched: MatchedTruth) -> tuple[dict[str,
     for name, with_scale in (("sim3", True), ("se3", False)):
         for frames, rows in (("all", usable), ("keyframes", usable & t.is_keyframe)):
             cells[f"{name} {frames}"] = _ate(estimate[rows, :3, 3], truth[rows, :3, 3], with_scale)
+        if outcome.every is not None:
+            cells[f"{name} every image"] = _ate_of_every(outcome.every, matched.sequence, with_scale)
     if not outcome.metric:
-        for frames in ("all", "keyframes"):
-            cells[f"se3 {frames}"] = {"missing": "the run has no metric scale"}
+        for key in [key for key in cells if key.startswith("se3")]:
+            cells[key] = {"missing": "the run has no metric scale"}
     try:
         sim3 = absolute_error(estimate[usable, :3, 3], truth[usable, :3, 3], with_scale=True)
     except ValueError as error:
@@ -170,6 +175,12 @@ def _ate(centers: NDArray, true_centers: NDArray, with_scale: bool) -> dict[str,
     except ValueError as problem:
         return {"missing": str(problem)}
     return {**asdict(error.statistics), "scale": error.alignment.scale, "frames": len(centers)}
+
+
+def _ate_of_every(every: Trajectory, sequence: Sequence, with_scale: bool) -> dict[str, Any]:
+    truth = match_by_time(every.timestamps, sequence)
+    rows = every.is_placed & truth.has_pose
+    return _ate(every.centers[rows], truth.world_from_cam[rows, :3, 3], with_scale)
 
 
 def _rpe(estimate: NDArray, truth: NDArray, scale: float) -> dict[str, Any]:

@@ -91,6 +91,8 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
 def _figures(outcome: Outcome, views: RenderedViews | None) -> list[tuple[str, str]]:
     t = outcome.trajectory
     pairs = [("frames posed", f"{int(t.is_posed.sum())} / {len(t.frame_ids)}")]
+    if outcome.every is not None:
+        pairs.append(("images of the source posed", f"{outcome.every.is_posed.sum()} / {len(outcome.every.frame_ids)}"))
     if t.by_rotation.any():
         pairs.append(("of them by rotation alone", str(int(t.by_rotation.sum()))))
     pairs.append(("keyframes", str(int(t.is_keyframe.sum()))))

@@ -44,10 +44,11 @@ def match_truth(frames: list[Frame], names_are_the_sources: bool, sequence: Sequ
         if sequence.world_from_cam is not None:
             poses[image >= 0] = sequence.world_from_cam[image[image >= 0]]
         return MatchedTruth(sequence, poses, image, "file name")
-    return _match_by_time(np.array([f.timestamp for f in frames]), sequence)
+    return match_by_time(np.array([f.timestamp for f in frames]), sequence)
 
 
-def _match_by_time(times: NDArray[np.float64], sequence: Sequence) -> MatchedTruth:
+def match_by_time(times: NDArray[np.float64], sequence: Sequence) -> MatchedTruth:
+    """Truth of the instants (N,) in seconds, which may differ from the sequence's by a constant."""
     pose_times, true_poses = true_trajectory(sequence)
     start = 0.0
     if sequence.timestamps[0] > times[-1] + 1:

@@ -164,6 +164,8 @@ def evaluation_rows(result: dict[str, Any]) -> list[Row]:
     stage = result["stage"]
     frames = result["frames"]
     of = f"{frames['picked']} picked, {frames['keyframes']} keyframes, {frames['with true pose']} with a true pose"
+    if "images" in frames:
+        of += f"; of the source's {frames['images']} images {frames['images posed']} are posed"
     if frames.get("by rotation alone"):
         of += f"; {frames['by rotation alone']} by rotation alone, which no error of a place counts"
     rows = [("frames posed", str(frames["posed"]), of), _camera_row(result["camera"])]
@@ -189,8 +191,9 @@ def _trajectory_rows(cells: dict[str, Any], stage: str) -> list[Row]:
         return _missing("trajectory", cells)
     rows = []
     for key, name in (("sim3", "ATE Sim(3)"), ("se3", "ATE SE(3)")):
-        for frames in ("all", "keyframes"):
-            cell = cells[f"{key} {frames}"]
+        for frames in ("all", "keyframes", "every image"):
+            if (cell := cells.get(f"{key} {frames}")) is None:
+                continue
             if "missing" in cell:
                 rows += _missing(f"{name}, {frames}", cell)
                 continue

@@ -58,7 +58,12 @@ _ENTRIES = (
         "names sparse/0/points3D.ply to start from.",
         "colmap",
     ),
-    Entry("trajectory.txt", "poses in TUM format: timestamp tx ty tz qx qy qz qw (camera in the world); evo.", "tum"),
+    Entry(
+        "trajectory.txt",
+        "a pose for every image of the source, those between the frames of images/ too, in TUM format: timestamp tx "
+        "ty tz qx qy qz qw (camera in the world); evo.",
+        "tum",
+    ),
     Entry(
         "point_cloud.ply",
         "the map: Gaussians in the layout of the original 3D Gaussian splatting; after it class_id, and class_prob_N, "

@@ -130,12 +130,14 @@ def _by_class(cloud: GaussianCloud, outcome: Outcome) -> GaussianCloud:
 
 
 def write_trajectory(outcome: Outcome, folder: Path) -> list[Path]:
-    """The poses of all posed frames, of panoramas those of their middle; a comment names those that only turned."""
-    t, note = outcome.trajectory, lengths(outcome.metres, outcome.metric)
+    """The poses of all posed images of the source, where only frames have one of these, and of panoramas those of their
+    middle; a comment names those that only turned."""
+    t, note = outcome.every or outcome.trajectory, lengths(outcome.metres, outcome.metric)
     if t.by_rotation.any():
         note += f"\nTurned only, so put at their neighbours' positions: frames {stretches(t.frame_ids[t.by_rotation])}."
     posed = np.flatnonzero(t.is_posed)
-    posed = posed[t.frame_ids[posed] < rig_of(outcome.calibration.directions, len(outcome.frames)).stations]
+    if outcome.every is None:
+        posed = posed[t.frame_ids[posed] < rig_of(outcome.calibration.directions, len(outcome.frames)).stations]
     write_tum(folder / "trajectory.txt", t.timestamps[posed], t.world_from_cam[posed], note)
     return [folder / "trajectory.txt"]
 

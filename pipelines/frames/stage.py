@@ -61,7 +61,6 @@ from .tasks import (
     structure_from_motion,
 )
 
-_SIGNIFICANT_SHIFT_PX = 0.3
 _FEW_KEYFRAMES = 12
 _UNSURE_FOCAL = 0.05
 
@@ -266,7 +265,7 @@ def _write_correspondences(context: StageContext, structure: Structure, keyframe
 def _write_frames(context: StageContext, source: AnySource, frames: list[Frame], lens: Lens) -> None:
     """The frames without distortion; those of a lens without any are the picked ones, byte for byte."""
     missing = [f for f in frames if not (context.folder / f.name).exists()]
-    if lens.shift_px <= _SIGNIFICANT_SHIFT_PX:
+    if lens.is_straight:
         for frame in context.progress.track(missing, "frames", len(missing)):
             copy_file(picked(context, frame.name), context.folder / frame.name)
         return

@@ -37,6 +37,7 @@ from ..tracking.adjust import align_depths, without_dependent_depth
 from ..tracking.pictures import Pictures, load_shutter
 from ..tracking.state import FEATURE_SD, TrackState, to_sparse_model
 from ..types import VOID, Intrinsics, Trajectory
+from .between import pose_every_frame
 from .candidates import LabelSummary, loop_candidates, summarise_labels
 from .close import Closed, close_loops
 from .loops import FoundLoops, KeyframeView, Loop, find_loops, make_view
@@ -83,7 +84,10 @@ def run(context: StageContext) -> dict[str, Any]:
         if gaussian_map is None:
             gaussian_map = context.run.load(MAP, "mapping").to(context.device)
         refined = refine_map(context, gaussian_map, trajectory, fields, JOINT_PASSES)
-    return save(context, model, trajectory, gaussian_map, found, closed, refined, moved_px)
+    figures, trajectory = save(context, model, trajectory, gaussian_map, found, closed, refined, moved_px)
+    figures |= pose_every_frame(context, model, trajectory)
+    FIGURES["global_ba"].save(context.folder, figures)
+    return figures
 
 
 def search(context: StageContext, model: SparseModel) -> FoundLoops:
@@ -223,8 +227,8 @@ def save(
     closed: Closed | None,
     refined: Refined | None,
     moved_px: float,
-) -> dict[str, Any]:
-    """Write the result, with mapping's own map where there is no other; returns its key figures."""
+) -> tuple[dict[str, Any], Trajectory]:
+    """Write the result, with mapping's own map where there is no other; returns its key figures and the poses."""
     exposure = context.run.load(EXPOSURE)
     if refined is not None and refined.is_better:
         result = refined.result
@@ -251,8 +255,7 @@ def save(
         "joint_psnr_before": None if refined is None else round(refined.psnr_before, 3),
         "joint_psnr_after": None if refined is None else round(refined.psnr_after, 3),
     }
-    FIGURES["global_ba"].save(context.folder, figures)
-    return figures
+    return figures, trajectory
 
 
 STAGE = Stage("global_ba", run)

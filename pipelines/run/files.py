@@ -7,7 +7,7 @@ which is read again, has its row beside its type in `scene/world.py`), and snaps
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -225,6 +225,9 @@ TRAJECTORY: RunFile[Trajectory] = RunFile(
     },
 )  # fmt: skip
 """The poses as a stage left them."""
+
+EVERY_FRAME: RunFile[Trajectory] = replace(TRAJECTORY, name="every_frame.npz", stages=("global_ba",))
+"""The poses of all images of the source, which frame_ids count; none where all of them were picked."""
 
 
 def _depth_fields(arrays: Arrays) -> DepthFields:

@@ -18,7 +18,7 @@ class FramePixels:
         k = calibration.intrinsics
         v, u = np.indices((k.height, k.width)) + 0.5
         rays = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones_like(u)], axis=-1).reshape(-1, 3)
-        camera = to_pycolmap(_distorted_camera(calibration))
+        camera = to_pycolmap(distorted_camera(calibration))
         self._size = (k.width, k.height)
         self._xy = camera.img_from_cam(rays).reshape(k.height, k.width, 2)
 
@@ -30,7 +30,7 @@ class FramePixels:
         return image[row.clip(0, image.shape[0] - 1), column.clip(0, image.shape[1] - 1)]
 
 
-def _distorted_camera(calibration: Calibration) -> Camera:
+def distorted_camera(calibration: Calibration) -> Camera:
     """The lens before undistortion, which may have enlarged the image to fill the frame."""
     k, zoom = calibration.intrinsics, 1.0
     for _ in range(6):

@@ -233,15 +233,22 @@ def follow_others(state: TrackState, intrinsics: Intrinsics, adjusted: set[int],
     velocity = state.velocities() if state.shutter.is_rolling else {}
     for frame_id in others:
         seen = state.sightings[frame_id]
-        seen = seen.select(alive[seen.point])
-        xy = seen_at_once(frame_id, seen, state, intrinsics, velocity)
-        xy -= source_errors(seen, state, intrinsics, velocity)
-        known = np.asarray(np.isfinite(xy).all(1))
-        seen, xy = seen.select(known), xy[known]
-        state.sightings[frame_id] = seen
-        if len(seen) >= 6:
-            points = state.points[seen.point]
-            state.poses[frame_id] = adjust_pose(state.poses[frame_id], points, xy, seen.sd, intrinsics)
+        state.sightings[frame_id] = seen.select(alive[seen.point])
+        settle(frame_id, state, intrinsics, velocity)
+
+
+def settle(frame_id: int, state: TrackState, intrinsics: Intrinsics, velocity: dict[int, Array]) -> None:
+    """Settle a frame's pose on the points it sees, in place; of its sightings those stay that are still known.
+    velocity: as in `seen_at_once`."""
+    seen = state.sightings[frame_id]
+    xy = seen_at_once(frame_id, seen, state, intrinsics, velocity)
+    xy -= source_errors(seen, state, intrinsics, velocity)
+    known = np.asarray(np.isfinite(xy).all(1))
+    seen, xy = seen.select(known), xy[known]
+    state.sightings[frame_id] = seen
+    if len(seen) >= 6:
+        points = state.points[seen.point]
+        state.poses[frame_id] = adjust_pose(state.poses[frame_id], points, xy, seen.sd, intrinsics)
 
 
 def source_errors(seen: Sightings, state: TrackState, intrinsics: Intrinsics, velocity: dict[int, Array]) -> Array:

@@ -17,9 +17,10 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome, refined_pose, trajectory_cells
 from msgs_slam.pipelines.evaluation.mesh_error import mesh_cells
 from msgs_slam.pipelines.evaluation.truth import match_truth, true_trajectory
-from msgs_slam.pipelines.evaluation.write import write_evaluation
+from msgs_slam.pipelines.evaluation.write import evaluation_table, write_evaluation
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import Similarity
+from msgs_slam.pipelines.mapping.move_map import rows_of
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.render.api import render
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -113,6 +114,18 @@ def test_a_video_is_matched_by_time_and_a_shifted_clock_too(oracle_run: OracleRu
     assert "shifted" in matched.by
     between = [Frame(i, f"{i}.jpg", 0.1 * i + 0.05, i, 1.0) for i in range(8)]
     assert (match_truth(between, False, truth).image == -1).all()
+
+
+def test_every_image_of_the_source_is_judged_beside_the_picked_frames(oracle_run: OracleRun, truth: Sequence) -> None:
+    outcome = load_outcome(oracle_run(video=True))
+    every = outcome.trajectory
+    picked = replace(outcome, frames=outcome.frames[::2], trajectory=rows_of(every, every.frame_ids[::2]), every=every)
+    result = evaluate_outcome(picked, truth, max_views=1)
+    assert [result["trajectory"][f"sim3 {rows}"]["frames"] for rows in ("all", "every image")] == [16, 32]
+    assert result["trajectory"]["se3 every image"]["max"] < 1e-6
+    table = evaluation_table(result)
+    assert "of the source's 32 images 32 are posed" in table
+    assert "ATE SE(3), every image" in table
 
 
 def test_dense_poses_beside_sparse_images(truth: Sequence, shared_data: Path) -> None:
