@@ -6,13 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ..compute.ssim import ssim_map
 from ..geometry.posed_depth import PosedDepth
-from ..render.api import Rendering, render
-from ..render.gaussian_map import GaussianMap, decided_channels
-from ..render.inspection import median_and_seen
+from ..render.gaussian_map import GaussianMap
+from ..render.inspection import look
 from ..types import VOID, Intrinsics
 from .views import View
 
@@ -35,46 +33,25 @@ def measure_view(
     cam_from_world: NDArray[np.float64],
     log_gain: NDArray[np.float32],
     offset: NDArray[np.float32],
-    features: Tensor | None = None,
 ) -> ViewFigures:
     """Compare the map, seen from `cam_from_world` (4, 4) with the given exposure (3,), with what the view shows of the
-    scene; `features`: as of `features_of`, who measures several views makes them once. NaN for a view that is all
-    masked: what is not compared agrees with nothing."""
-    rendering = draw_map(gaussian_map, view, cam_from_world, features)
-    colors = rendering.features[..., :3] * torch.exp(torch.tensor(log_gain)).to(view.image.device)
+    scene. NaN for a view that is all masked: what is not compared agrees with nothing."""
+    pose = torch.tensor(cam_from_world, dtype=torch.float64)  # a copy: workers get arrays to read only
+    seen = look(gaussian_map, pose, view.intrinsics)
+    colors = seen.colors * torch.exp(torch.tensor(log_gain)).to(view.image.device)
     colors = (colors + torch.tensor(offset).to(view.image.device)).clamp(0, 1)
     photo = view.of_scene(view.colors, colors)
     error = ((colors - photo).square().mean() / view.shown).clamp(min=1e-10)
-    known = view.depth > 0
+    known, labelled = view.depth > 0, view.channels != VOID
     judged = 1.0 if view.scene is None or view.scene.any() else float("nan")
-    depth_l1 = (rendering.depth - view.depth).abs()[known].mean() if known.any() else torch.tensor(float("nan"))
+    depth_l1 = (seen.depth - view.depth).abs()[known].mean() if known.any() else torch.tensor(float("nan"))
+    agrees = (seen.channels == view.channels)[labelled].float()
     return ViewFigures(
         psnr=judged * float(-10 * torch.log10(error)),
         ssim=judged * float(ssim_map(colors, photo).mean()),
         depth_l1=float(depth_l1),
-        label_agreement=_label_agreement(rendering, view),
+        label_agreement=float(agrees.mean()) if len(agrees) and gaussian_map.class_logits.shape[1] else float("nan"),
     )
-
-
-def _label_agreement(rendering: Rendering, view: View) -> float:
-    logits, known = rendering.features[..., 3:], view.channels != VOID
-    if logits.shape[-1] == 0 or not known.any():
-        return float("nan")
-    return float((logits.argmax(-1) == view.channels)[known].float().mean())
-
-
-def features_of(gaussian_map: GaussianMap) -> Tensor:
-    """(M, 3 + C) colours ++ class logits."""
-    return torch.cat([gaussian_map.colors, gaussian_map.class_logits], dim=1)
-
-
-def draw_map(
-    gaussian_map: GaussianMap, view: View, cam_from_world: NDArray[np.float64], features: Tensor | None = None
-) -> Rendering:
-    """Colours ++ class logits, depth and silhouette from a camera."""
-    pose = torch.tensor(cam_from_world, dtype=torch.float64)  # a copy: workers get arrays to read only
-    m, drawn = gaussian_map, features_of(gaussian_map) if features is None else features
-    return render(m.means, m.radii, m.opacities, drawn, pose, view.intrinsics)
 
 
 def mean_figures(figures: Sequence[ViewFigures], prefix: str) -> dict[str, float]:
@@ -126,18 +103,14 @@ class Shown(Sequence[PosedDepth]):
 @torch.no_grad()
 def drawn_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> DrawnView:
     """Median depth with a weight: none where the map is thin or the depth jumps, less far away."""
-    m, pose = gaussian_map, torch.as_tensor(cam_from_world)
-    radii, opacities = m.radii, m.opacities
-    median, seen = median_and_seen(m.means, radii, opacities, pose, camera)
-    depth, features = median.cpu().numpy(), torch.cat([m.colors[seen], m.class_logits[seen]], dim=1)
-    rendering = render(m.means[seen], radii[seen], opacities[seen], features, pose, camera)
-    silhouette, features = rendering.silhouette.cpu().numpy(), rendering.features
+    seen = look(gaussian_map, torch.as_tensor(cam_from_world), camera)
+    depth, silhouette = seen.median.cpu().numpy(), seen.silhouette.cpu().numpy()
     solid = (silhouette > 0.7) & (depth > 0) & ~_jumps(depth)
     typical = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
     # The error of a depth grows with its square.
     weight = np.where(solid, np.clip(typical / np.maximum(depth, 1e-9), 0.2, 1.5) ** 2 * silhouette, 0)
-    channels = decided_channels(features[..., 3:]).to(torch.int16).cpu().numpy() if features.shape[-1] > 3 else None
-    colors = (features[..., :3].clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    channels = seen.channels.cpu().numpy() if gaussian_map.class_logits.shape[1] else None
+    colors = (seen.colors.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     return DrawnView(
         PosedDepth(camera, cam_from_world, depth.astype(np.float32), weight.astype(np.float32)), colors, channels
     )

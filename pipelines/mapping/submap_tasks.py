@@ -30,7 +30,7 @@ from ..system.progress import Progress
 from ..types import Intrinsics, Trajectory
 from .exposure import SeenExposures, common_exposure
 from .load import MappingInput, load_views
-from .measure import ViewFigures, features_of, measure_view
+from .measure import ViewFigures, measure_view
 from .optimise import optimise_map
 from .state import KEYS, Exposures, OptimisedMap
 from .submaps import Submap, nearest_seeing
@@ -229,12 +229,11 @@ def measure_submap(task: SubmapTask, progress: Progress) -> tuple[list[ViewFigur
     given = task.views(task.trajectory, task.config.mapping.hold_out)
     rows = {int(i): row for row, i in enumerate(task.trajectory.frame_ids)}
     whole = together(maps)
-    features = features_of(whole)
     log_gains, offsets = task.exposure or _no_exposure(len(rows))
 
     def figures(view: View) -> ViewFigures:
         row = rows[view.frame_id]
-        return measure_view(whole, view, task.trajectory.cam_from_world[row], log_gains[row], offsets[row], features)
+        return measure_view(whole, view, task.trajectory.cam_from_world[row], log_gains[row], offsets[row])
 
     measured = [figures(v) for v in progress.track(given.views, "measuring", len(given.views))]
     return measured, [figures(v) for v in given.held_out]

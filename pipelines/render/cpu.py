@@ -10,9 +10,9 @@ from ..compute.threads import as_array
 from .cpu_backward import pull_back
 from .cpu_bands import split_into_bands
 from .cpu_forward import draw_bands, padded_channels
-from .cpu_inspect import class_weights, inspect, weighted_errors
+from .cpu_inspect import class_weights, inspect, look, weighted_errors
 
-__all__ = ["class_weights", "composite", "inspect", "weighted_errors"]
+__all__ = ["class_weights", "composite", "inspect", "look", "weighted_errors"]
 
 
 def composite(

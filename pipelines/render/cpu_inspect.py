@@ -11,13 +11,15 @@ from torch import Tensor
 from ..compute.lanes import load, maximum, reduce_max, splat, store, total, where
 from ..compute.threads import inlined, inner, kernel
 from .cpu_bands import PIXELS, TILE, Bands, clear, for_each_band, split_into_bands, walk_tiles
-from .cpu_forward import WEIGHTS, blend_rows, draw_bands
+from .cpu_forward import DEPTH_SUM, WEIGHTS, blend_rows, draw_bands, paint_rows
 
 F32 = np.float32
 MEDIAN, COUNT, PLANES = 2 * PIXELS, 3 * PIXELS, 4
 """Planes of a tile's state behind those of `blend_rows`: median depths, and what a pixel counts."""
 ONLY, IS_MIXED = PIXELS, PIXELS + 1
 """Behind the classes of a tile's pixels: the class that is seen, and 1 where there are more."""
+STRENGTH, CHANNEL, LOOKED = 3, 4, 5
+"""Of a Gaussian's features that are looked at: behind its colours how sure its class is, the class, and how many."""
 _HALF, _ZERO = F32(0.5), F32(0)
 
 
@@ -56,8 +58,20 @@ def class_weights(
     return _walk(bands, torch.where(known, counts, 0.0), torch.where(known, channels, 0), classes)[1][:, 2:]
 
 
+def look(
+    u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, features: Tensor, classes: int, width: int,
+    height: int, near: float,
+) -> tuple[Tensor, ...]:  # fmt: skip
+    """Draw colours (H, W, 3), and (H, W) each the depth sum, silhouette, median depth, and of the classes the largest
+    sum of strengths and the one that has it; features (M, 5): colour, strength, class; float32 CPU tensors."""
+    bands = bands_of((u, v, sigma_px, z, opacity), features, width, height, near)
+    colors, planes = np.empty((height, width, 3), F32), np.empty((5, height, width), F32)
+    for_each_band(lambda b: look_band(classes, b, *bands.prepared[b], colors, planes), bands.starts)
+    return torch.from_numpy(colors), *torch.from_numpy(planes).unbind(0)
+
+
 def bands_of(gaussians: tuple[Tensor, ...], colors: Tensor | None, width: int, height: int, near: float) -> Bands:
-    """Make the bands of projected Gaussians, with or without three features."""
+    """Make the bands of projected Gaussians, with or without features."""
     projected = tuple(tensor.detach().contiguous().numpy() for tensor in gaussians)
     features = np.zeros((len(projected[0]), 0), F32) if colors is None else colors.detach().contiguous().numpy()
     return split_into_bands(projected, features, features.shape[1], width, height, near)
@@ -96,6 +110,14 @@ def open_counts(job: tuple[Any, ...], kind: None, light: NDArray[np.float32], ti
     classes[ONLY], classes[IS_MIXED] = only, is_mixed
 
 
+@inner
+def note_median(state: NDArray[np.float32], row: int, weight: Any, behind: Any, depth: np.float32) -> None:
+    """Note the depth of a Gaussian behind which less than half of the light is left, where no nearer one is noted."""
+    before = load(state, MEDIAN + row)
+    here = (behind < splat(_HALF)) & (weight > splat(_ZERO)) & (before <= splat(_ZERO))
+    store(state, MEDIAN + row, before + where(here, splat(depth)))
+
+
 @inlined
 def weigh(
     job: tuple[Any, ...], kind: None, light: NDArray[np.float32], falloff_y: NDArray[np.float32], i: int,
@@ -109,9 +131,7 @@ def weigh(
     for row in range(TILE * y0, TILE * y1 + TILE, TILE):
         weight, behind = load(state, WEIGHTS + row), load(light, row)
         summed, top_weight = summed + weight * load(state, COUNT + row), maximum(top_weight, weight)
-        before = load(state, MEDIAN + row)
-        here = (behind < splat(_HALF)) & (weight > splat(_ZERO)) & (before <= splat(_ZERO))
-        store(state, MEDIAN + row, before + where(here, splat(pair[5])))
+        note_median(state, row, weight, behind, pair[5])
     sum_here = total(summed)
     seen[i, 0] += sum_here
     seen[i, 1] = max(seen[i, 1], reduce_max(top_weight))
@@ -161,3 +181,65 @@ def inspect_band(
         row = shared[slots[i] + band - first[i]] if slots[i + 1] > slots[i] else found[i]
         for c in range(found.shape[1]):
             row[c] = seen[k, c]
+
+
+@inner
+def open_look(job: tuple[Any, ...], classes: int, light: NDArray[np.float32], tile: tuple[int, ...]) -> None:
+    """Empty the tile's image, its depths and the planes of its classes."""
+    clear(job[0])
+    clear(job[1])
+
+
+@inlined
+def see(
+    job: tuple[Any, ...], classes: int, light: NDArray[np.float32], falloff_y: NDArray[np.float32], i: int,
+    box: tuple[int, ...], pair: tuple[Any, ...],
+) -> None:  # fmt: skip
+    """Blend one Gaussian's colours, and its strength into the plane of its class; note the median depth."""
+    image, state, features = job[0], job[1], job[2]
+    _, _, y0, y1 = box
+    blend_rows(light, state, falloff_y, y0, y1, pair)
+    paint_rows(image, state, features, LOOKED * i, y0, y1)
+    strength, plane = features[LOOKED * i + STRENGTH], PIXELS * (3 + int(features[LOOKED * i + CHANNEL]))
+    for row in range(TILE * y0, TILE * y1 + TILE, TILE):
+        weight = load(state, WEIGHTS + row)
+        store(image, plane + row, load(image, plane + row) + weight * strength)
+        note_median(state, row, weight, load(light, row), pair[5])
+
+
+@inner
+def close_look(job: tuple[Any, ...], classes: int, light: NDArray[np.float32], tile: tuple[int, ...]) -> None:
+    """Write the tile into the images."""
+    image, state, colors, planes = job[0], job[1], job[3], job[4]
+    left, top, columns, rows = tile
+    for y in range(rows):
+        for x in range(columns):
+            pixel, best = TILE * y + x, 0
+            for c in range(3):
+                colors[top + y, left + x, c] = image[PIXELS * c + pixel]
+            for c in range(1, classes):
+                if image[PIXELS * (3 + c) + pixel] > image[PIXELS * (3 + best) + pixel]:
+                    best = c
+            planes[0, top + y, left + x] = state[DEPTH_SUM + pixel]
+            planes[1, top + y, left + x] = F32(1) - light[pixel]
+            planes[2, top + y, left + x] = state[MEDIAN + pixel]
+            planes[3, top + y, left + x] = image[PIXELS * (3 + best) + pixel]
+            planes[4, top + y, left + x] = best
+
+
+@kernel
+def look_band(
+    classes: int,
+    band: int,
+    records: NDArray[np.float32],
+    features: NDArray[np.float32],
+    tile_starts: NDArray[np.int64],
+    members: NDArray[np.int32],
+    colors: NDArray[np.float32],
+    planes: NDArray[np.float32],
+) -> None:
+    """Fill the band's rows of what `look` returns."""
+    height, width = colors.shape[:2]
+    image, state = np.empty(PIXELS * (3 + max(classes, 1)), np.float32), np.empty(3 * PIXELS, np.float32)
+    job = (image, state, features, colors, planes)
+    walk_tiles((open_look, see, close_look), job, classes, band, tile_starts, members, records, width, height)

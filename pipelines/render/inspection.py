@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from ..types import Intrinsics
-from .api import NEAR, choose_backend, in_view, kernels_for, project_map, render, require_finite
+from .api import NEAR, choose_backend, depth_ratio, in_view, kernels_for, project_map, render, require_finite
+from .gaussian_map import DECIDED_LOGIT, GaussianMap, decided_channels
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,19 @@ class BlendingWeights:
 
     total: Tensor
     largest: Tensor
+
+
+@dataclass(frozen=True)
+class Look:
+    """colors (H, W, 3); depth and silhouette (H, W) as of a `Rendering`; median (H, W) as of `median_depth`; channels
+    (H, W) int16: the class for which most is said, each Gaussian speaking for the strongest of its own as far as it is
+    seen, -1 where nothing decides."""
+
+    colors: Tensor
+    depth: Tensor
+    median: Tensor
+    silhouette: Tensor
+    channels: Tensor
 
 
 def median_depth(
@@ -34,13 +48,34 @@ def median_depth(
     return _inspect(means, radii, opacities, cam_from_world, intrinsics, near, backend)[0]
 
 
-def median_and_seen(
-    means: Tensor, radii: Tensor, opacities: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics
-) -> tuple[Tensor, Tensor]:
-    """The `median_depth`, and the rows (n,) of the Gaussians that have a weight in the image: what hides behind walls
-    has none, and without it the same image is rendered."""
-    median, _, largest = _inspect(means, radii, opacities, cam_from_world, intrinsics, NEAR, None)
-    return median, torch.nonzero(largest)[:, 0]
+@torch.no_grad()
+def look(gaussian_map: GaussianMap, cam_from_world: Tensor, intrinsics: Intrinsics, backend: str | None = None) -> Look:
+    """What a camera at (4, 4) sees of a map, by one walk over it on the CPU. No gradients."""
+    m, size = gaussian_map, (intrinsics.width, intrinsics.height)
+    classes = m.class_logits.shape[1]
+    if (module := _compiled(backend, m.means)) is not None:
+        m = m.only(in_view(m.means, m.radii, cam_from_world, intrinsics))
+        projected = project_map(m.means, m.radii, cam_from_world, intrinsics)
+        features = torch.cat([m.colors, *_strongest(m.class_logits)], dim=1)
+        require_finite("features", features)
+        found = module.look(*projected, m.opacities, features, classes, *size, NEAR)
+        colors, depth_sum, silhouette, median, strength, channel = found
+        channels = torch.where(strength > DECIDED_LOGIT, channel, -1) if classes else torch.full_like(channel, -1)
+        return Look(colors, depth_ratio(depth_sum, silhouette), median, silhouette, channels.to(torch.int16))
+    strength, channel = _strongest(m.class_logits)
+    own = torch.zeros_like(m.class_logits).scatter_(1, channel.long(), strength) if classes else m.class_logits
+    seen, beside = (m.means, m.radii, m.opacities), (cam_from_world, intrinsics)
+    drawn = render(*seen, torch.cat([m.colors, own], dim=1), *beside, backend=backend)
+    channels, median = decided_channels(drawn.features[..., 3:]), median_depth(*seen, *beside, backend=backend)
+    return Look(drawn.features[..., :3], drawn.depth, median, drawn.silhouette, channels.to(torch.int16))
+
+
+def _strongest(logits: Tensor) -> tuple[Tensor, Tensor]:
+    """(M, 1) each: the largest of the class logits (M, C), and which that is; zeros without classes."""
+    if logits.shape[1] == 0:
+        return logits.new_zeros(len(logits), 1), logits.new_zeros(len(logits), 1)
+    strength, channel = logits.max(1, keepdim=True)
+    return strength, channel.to(logits)
 
 
 def blending_weights(
