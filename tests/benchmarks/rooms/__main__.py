@@ -1,0 +1,142 @@
+"""Depth in made rooms that nobody tuned on: forty to choose on, forty to judge on, and any number to learn from.
+
+    python -m tests.benchmarks.rooms make DIR --set judge                   rooms of a set and the stereo's first pass
+    python -m tests.benchmarks.rooms measure DIR NAME --set judge           the product's depth of them, kept as NAME
+    python -m tests.benchmarks.rooms table DIR OLD [NEW] --set judge        one against the other
+
+A default about depth is chosen on `choose` and reported on `judge`. A room is a seed: walls, textures, light, furniture
+(of Debian's `sweethome3d-furniture`, downloaded by apt-get or given by --package; none of it is in the repository), a
+walk of 12 keyframes, a camera; 15 CPU seconds each. Needs `pip install embreex`. Poses are those of the walk up to a
+millimetre. "off": wrong by more than 5 %; "unsure": confidence below 0.3 in OLD.
+"""
+
+import argparse
+import os
+import time
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .clip import Clip, make_clip
+from .furniture import furniture
+
+SETS = {"choose": (1000, 40), "judge": (2000, 40), "learn": (10_000, 300)}
+"""First seed and number of rooms; seeds without a place to walk are passed over."""
+SURE, OFF = 0.3, 0.05
+
+
+def seeds_of(folder: Path, name: str, make: bool = False, package: Path | None = None, most: int = 0) -> list[int]:
+    """Seeds of the rooms of a set that are in the folder; `make` makes those that are missing."""
+    first, count = SETS[name]
+    count = min(most or count, count)
+    found: list[int] = []
+    for seed in range(first, first + 2 * count):
+        if len(found) == count:
+            break
+        path = folder / f"{seed}.npz"
+        if make and not path.exists():
+            start = time.process_time()
+            clip = make_clip(seed, furniture(str(folder), str(package or "")))
+            if clip is None:
+                continue
+            clip.save(path)
+            clip.stereo(folder / "stereo" / str(seed))
+            print(f"{seed} {clip.kind}: {time.process_time() - start:.1f} CPU seconds", flush=True)
+        if path.exists():
+            found.append(seed)
+    return found
+
+
+def measure(folder: Path, seeds: list[int], name: str) -> None:
+    """Keep depth (0: none) and confidence of every keyframe by the product as it is."""
+    target = folder / "depth" / name
+    target.mkdir(parents=True, exist_ok=True)
+    for seed in seeds:
+        if (target / f"{seed}.npz").exists():
+            continue
+        provider, frames = Clip.load(folder / f"{seed}.npz").stereo(folder / "stereo" / str(seed))
+        start = time.process_time()
+        found = [provider.estimate(f) for f in frames]
+        spent = (time.process_time() - start) / len(frames)
+        depth, confidence = np.stack([f.depth for f in found]), np.stack([f.confidence for f in found])
+        np.savez_compressed(
+            target / f"{seed}.npz",
+            depth=depth.astype(np.float16),
+            confidence=confidence.astype(np.float16),
+            spent=spent,
+        )
+
+
+def table(folder: Path, seeds: list[int], names: list[str]) -> None:
+    """A row a kind of room, then all, then the worst room; figures of each name beside each other."""
+    rows: dict[int, dict[str, NDArray]] = {}
+    kinds = {}
+    for seed in seeds:
+        clip = Clip.load(folder / f"{seed}.npz")
+        truth, unsure = clip.truth.astype(np.float32), None
+        kinds[seed], rows[seed] = clip.kind, {}
+        for name in names:
+            with np.load(folder / "depth" / name / f"{seed}.npz", allow_pickle=False) as held:
+                depth, confidence = held["depth"].astype(np.float32), held["confidence"].astype(np.float32)
+                spent = float(held["spent"])
+            unsure = confidence < SURE if unsure is None else unsure
+            rows[seed][name] = np.array([*figures(depth, confidence, truth, unsure), spent])
+    for kind in sorted(set(kinds.values())):
+        _print(f"{kind} ({list(kinds.values()).count(kind)})", [rows[s] for s in seeds if kinds[s] == kind], np.mean)
+    _print(f"all ({len(seeds)})", list(rows.values()), np.mean)
+    _print("worst", list(rows.values()), np.max)
+    if len(names) > 1:
+        old, new = (np.stack([r[n] for r in rows.values()]) for n in names)
+        better = [(new[:, k] <= old[:, k] * 1.001).sum() for k in (1, 4)]
+        print(f"rooms not worse: L1 {better[0]}, unsure pixels {better[1]} of {len(seeds)}")
+        ratio = new.mean(0) / old.mean(0)
+        print(f"new / old: L1 {ratio[1]:.3f}, error of unsure pixels {ratio[4]:.3f}, sure pixels off {ratio[3]:.3f}")
+
+
+COLUMNS = ("unsure %", "L1 cm", "off %", "sure off %", "unsure error %", "unsure off %", "<2% off %", "CPU s")
+
+
+def figures(depth: NDArray, confidence: NDArray, truth: NDArray, unsure: NDArray) -> tuple[float, ...]:
+    """Of a room, as COLUMNS; "unsure error" is the mean of |log depth ratio|, at most 1; "<2% off": of the pixels of
+    the highest confidence (0.4 or more) those that are off."""
+    known = truth > 0
+    unsure = unsure & known
+    shown = np.where(depth > 0, depth, 1e-3)
+    error = np.minimum(np.abs(np.log(shown[known] / truth[known])), 1)
+    metres, off, guess = np.abs(depth - truth)[known], error > np.log(1 + OFF), unsure[known]
+    sure, trusted = ~guess, confidence[known] >= 0.4
+    shares = [100 * guess.mean(), 100 * metres.mean(), 100 * off.mean(), 100 * off[sure].mean()]
+    return (*shares, 100 * error[guess].mean(), 100 * off[guess].mean(), 100 * off[trusted].mean())
+
+
+def _print(title: str, rows: list[dict[str, NDArray]], summary: object) -> None:
+    print(title)
+    for name in rows[0]:
+        values = summary(np.stack([r[name] for r in rows]), axis=0)  # type: ignore[operator]
+        print(f"  {name:12s}", "  ".join(f"{c} {v:.2f}" for c, v in zip(COLUMNS, values, strict=True)), flush=True)
+
+
+def main() -> None:
+    """Parse, do."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("make", "measure", "table"))
+    parser.add_argument("folder", type=Path, metavar="DIR")
+    parser.add_argument("names", nargs="*", metavar="NAME")
+    parser.add_argument("--set", choices=SETS, default="choose")
+    parser.add_argument("--rooms", type=int, default=0, help="only the first so many of the set")
+    parser.add_argument("--package", type=Path, help="the .deb file of the furniture")
+    given = parser.parse_args()
+    cv2.setNumThreads(1)
+    seeds = seeds_of(given.folder, given.set, given.what == "make", given.package, given.rooms)
+    if given.what == "measure":
+        measure(given.folder, seeds, *given.names)
+    elif given.what == "table":
+        table(given.folder, seeds, given.names)
+
+
+if __name__ == "__main__":
+    main()
