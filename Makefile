@@ -6,11 +6,17 @@ CACHE := $(if $(XDG_CACHE_HOME),$(XDG_CACHE_HOME),$(HOME)/.cache)
 TESTED := $(or $(MSGS_SLAM_TESTED),$(CACHE)/msgs-slam/tested-$(shell pwd | cksum | cut -d' ' -f1))
 PIP := -m pip install --quiet --disable-pip-version-check
 
+# What PyPI has for Linux brings several gigabytes of CUDA, which a machine without an NVIDIA driver has no use for.
+CPU_TORCH := 'torch>=2.6,<2.14' --index-url https://download.pytorch.org/whl/cpu
+
 .PHONY: demo test lint docs wheel clean
 
 demo:
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python $(PIP) .
+	nvidia-smi > /dev/null 2>&1 || $(VENV)/bin/python -c 'import torch' 2> /dev/null || \
+		{ echo "No NVIDIA driver: PyTorch for the CPU."; $(VENV)/bin/python $(PIP) --retries 1 $(CPU_TORCH); } || \
+		echo "download.pytorch.org cannot be reached: the PyTorch of PyPI, with CUDA."
+	$(VENV)/bin/python $(PIP) '.[viewer]'
 	$(VENV)/bin/msgs-slam models pull --yes || echo "The demo goes on without networks: few names, less certain metres."
 	$(VENV)/bin/msgs-slam demo
 

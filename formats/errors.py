@@ -1,4 +1,8 @@
-"""The one error a user is meant to read."""
+"""The one error a user is meant to read, and the commands that it names."""
+
+import importlib.util
+import shlex
+import sys
 
 
 class InputError(Exception):
@@ -20,3 +24,14 @@ class RecoverableError(InputError):
 
 class DiskFullError(RecoverableError):
     """The disk is full."""
+
+
+def install_command(*requirements: str) -> str:
+    """Return the shell command that installs packages beside this program, whatever environment the shell is in.
+
+    A bare `pip` is that of another interpreter, or refused, where this environment is not the active one; `uv` makes
+    environments without pip.
+    """
+    python = shlex.quote(sys.executable)
+    by = f"{python} -m pip install" if importlib.util.find_spec("pip") else f"uv pip install --python {python}"
+    return " ".join([by, *map(shlex.quote, requirements)])

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from .errors import InputError
+from .errors import InputError, install_command
 from .reading import parsing
 
 # The containers of one video each. Left out is what names other files (playlists, scripts, numbered images) or is made
@@ -331,7 +331,7 @@ def unreadable(path: Path, codec: str, first: int = 0) -> InputError:
         )
     return InputError(
         f"{path} is interlaced video (as from camcorders and television), which OpenCV does not decode: install PyAV "
-        f"with `pip install 'msgs-slam[hdr]'`, or convert it with `ffmpeg -i {file} -vf yadif OUT.mp4`"
+        f"with `{install_command('msgs-slam[hdr]')}`, or convert it with `ffmpeg -i {file} -vf yadif OUT.mp4`"
     )
 
 

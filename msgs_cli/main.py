@@ -33,7 +33,7 @@ from .options import (
     settings_options,
     source_options,
 )
-from .output import Output, flush_output, on_sigterm, prepare_streams, printable, say, verbosity_options
+from .output import Output, flush_output, on_sigterm, prepare_streams, printable, program, say, verbosity_options
 from .tables import print_summary, tell_run
 
 
@@ -285,7 +285,7 @@ def demo(
     output: Output,
     **given: str | int | None,
 ) -> None:
-    """Reconstruct a short video of a made-up room, compare with its known truth, print the errors and where to look."""
+    """Reconstruct a synthetic test clip and print its errors against ground truth."""
     from ..pipelines.demo import demo_summary, run_demo
     from ..pipelines.reconstruct import reconstruct as run_reconstruct
     from ..pipelines.run.folder import RunFolder
@@ -299,10 +299,13 @@ def demo(
             print_summary(run.root, records)
 
     result = run_demo(out, reconstruct_clip, output.progress())
-    say("\nAgainst the known truth:")
+    root = result.run.root
+    say("\nCompared with ground truth:")
     for line in demo_summary(result):
         say(f"  {line}")
-    root = result.run.root
+    say(f"\nNext:\n  {program()} view {quoted(root)}      # the map in your browser")
+    say(f"  {program()} report {quoted(root)}    # one HTML page: what was found, and how good it is")
+    say(f"  {program()} reconstruct video.mp4 # your own video, or a folder of images")
     output.tell_result(run=root, export=root / "export", evaluation=root / "evaluation")
 
 

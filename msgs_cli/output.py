@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
+import shlex
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -183,6 +185,13 @@ class TextHandler(logging.Handler):
             tqdm.write(text, file=sys.stderr)
         else:
             print(text, file=sys.stderr, flush=True)
+
+
+def program() -> str:
+    """Return the word that starts this program in the user's shell: its path where it is not on the PATH."""
+    own, found = Path(sys.argv[0]), shutil.which("msgs-slam")
+    is_elsewhere = own.name == "msgs-slam" and own.exists() and (found is None or not own.samefile(found))
+    return shlex.quote(str(own)) if is_elsewhere else "msgs-slam"
 
 
 def prepare_streams() -> None:

@@ -1,4 +1,4 @@
-"""The demo: a short synthetic video with known truth, reconstructed like any other video, judged against the truth."""
+"""The demo: a short synthetic video, reconstructed like any other video, evaluated against its ground truth."""
 
 import tempfile
 import zipfile
@@ -98,5 +98,5 @@ def demo_summary(result: DemoResult) -> list[str]:
     if "scaled_l1" in figures["depth"]:
         lines.append(f"depth: {100 * figures['depth']['scaled_l1']:.1f} cm mean error after one scale")
     root = result.run.root
-    lines += [f"look at {root / 'evaluation' / 'views.png'}", f"        {root / 'evaluation' / 'evaluation.md'}"]
+    lines += [f"images: {root / 'evaluation' / 'views.png'}", f"tables: {root / 'evaluation' / 'evaluation.md'}"]
     return lines

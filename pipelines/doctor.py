@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..formats.errors import install_command
 from .system.device import unused_card
 from .system.memory import available_cpus
 from .system.wording import BAD, GOOD, NOTE, Finding
@@ -47,7 +48,9 @@ def _program() -> Finding:
     try:
         return Finding("program", GOOD, f"{DISTRIBUTION} {importlib.metadata.version(DISTRIBUTION)}, {python}")
     except importlib.metadata.PackageNotFoundError:
-        return Finding("program", NOTE, f"run from its sources, {python}", "pip install . in the folder of the sources")
+        return Finding(
+            "program", NOTE, f"run from its sources, {python}", f"{install_command('.')} in the folder of the sources"
+        )
 
 
 def _requirements() -> Finding:
@@ -57,20 +60,20 @@ def _requirements() -> Finding:
     try:
         wanted = [Requirement(text) for text in importlib.metadata.requires(DISTRIBUTION) or ()]
     except importlib.metadata.PackageNotFoundError:
-        return Finding("requirements", NOTE, "unknown: the program is not installed", "pip install .")
-    wrong = []
+        return Finding("requirements", NOTE, "unknown: the program is not installed", install_command("."))
+    wrong, lacking = [], []
     for r in wanted:
         if r.marker is not None and not r.marker.evaluate({"extra": ""}):
             continue
         try:
             version = importlib.metadata.version(r.name)
         except importlib.metadata.PackageNotFoundError:
-            wrong.append(f"{r.name} is missing")
-            continue
-        if not r.specifier.contains(version, prereleases=True):
-            wrong.append(f"{r.name} is {version}, wanted {r.specifier}")
+            version = ""
+        if not version or not r.specifier.contains(version, prereleases=True):
+            wrong.append(f"{r.name} is {version}, wanted {r.specifier}" if version else f"{r.name} is missing")
+            lacking.append(f"{r.name}{r.specifier}")
     if wrong:
-        return Finding("requirements", BAD, "; ".join(wrong), f"pip install --upgrade {DISTRIBUTION}")
+        return Finding("requirements", BAD, "; ".join(wrong), install_command(*lacking))
     return Finding("requirements", GOOD, "every package is there in a version that fits")
 
 
@@ -83,7 +86,9 @@ def _libraries() -> Finding:
         except Exception as error:  # a broken wheel raises anything
             broken.append(f"{name} ({str(error).splitlines()[0] if str(error) else type(error).__name__})")
     if broken:
-        return Finding("libraries", BAD, "do not load: " + ", ".join(broken), "pip install --force-reinstall those")
+        return Finding(
+            "libraries", BAD, "do not load: " + ", ".join(broken), install_command("--force-reinstall", "PACKAGE")
+        )
     import torch
 
     return Finding("libraries", GOOD, f"all load; torch {torch.__version__}")
@@ -99,14 +104,14 @@ def _video() -> Finding:
         path = write_video(Path(folder) / "check.mp4", frames, 10.0)
         read = sum(1 for _ in VideoReader(path))
     if read != len(frames):
-        fix = "pip install --force-reinstall opencv-python-headless"
+        fix = install_command("--force-reinstall", "opencv-python-headless")
         return Finding("video", BAD, f"{read} of {len(frames)} frames came back from an MP4", fix)
     return Finding("video", GOOD, "MP4 is written and read")
 
 
 def _viewer() -> Finding:
     if importlib.util.find_spec("viser") is None:
-        return Finding("viewer", NOTE, "`msgs-slam view` is not installed", f"pip install '{DISTRIBUTION}[viewer]'")
+        return Finding("viewer", NOTE, "`msgs-slam view` is not installed", install_command(f"{DISTRIBUTION}[viewer]"))
     return Finding("viewer", GOOD, f"viser {importlib.metadata.version('viser')}")
 
 

@@ -163,7 +163,7 @@ def test_commands_of_the_docs_are_understood(line: str, tmp_path: Path, monkeypa
     (tmp_path / "video.msgs").mkdir()
     command: click.Command = main
     words = shlex.split(line.partition(">")[0], comments=True)[1:]
-    with click.Context(main) as context:
+    with click.Context(main, **main.context_settings) as context:
         while isinstance(command, click.Group):
             _, found, words = command.resolve_command(context, words)
             assert found is not None
@@ -253,6 +253,28 @@ def test_dockerfile_copies_what_is_here_and_asks_for_the_same_torch() -> None:
     assert [name for name in copied if not (ROOT / name).exists()] == []
     wanted = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
     assert re.findall(r'"(torch[^"]*)"', text) == [name for name in wanted if name.startswith("torch")]
+
+
+def test_the_install_is_the_same_everywhere() -> None:
+    """In README, on the site and in the Makefile; PyTorch for the CPU only where there is no NVIDIA driver."""
+    readme, home, tour = (
+        re.findall(r"```sh\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)[0]
+        for page in (DOCS[0], SITE / "index.md", SITE / "tour.md")
+    )
+    assert readme == home
+    lines = [[re.sub(r"\s+#.*", "", line) for line in block.splitlines()] for block in (readme, tour)]
+    assert lines[0][0].startswith("git clone ")
+    assert lines[0][1:4] == lines[1][:3]
+    torch, install = lines[0][2:4]
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    without_card, _, wanted = torch.partition(" || pip install ")
+    assert without_card == "nvidia-smi > /dev/null 2>&1"
+    assert f"{without_card} || " in makefile
+    assert f"CPU_TORCH := {wanted}\n" in makefile
+    assert f"$(PIP) {install.removeprefix('pip install ')}\n" in makefile.split("\ndemo:")[1].split("\n\n")[0]
+    needs = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
+    assert shlex.split(wanted)[0] in needs
+    assert "python3 -m venv .venv && . .venv/bin/activate" in lines[0], "Debian and Ubuntu refuse pip outside of one"
 
 
 def test_metadata_agrees_with_itself() -> None:

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Protocol, TypeVar
 
-from ...formats.errors import InputError, RecoverableError
+from ...formats.errors import InputError, RecoverableError, install_command
 from ..system.progress import Progress, log
 from ..system.stopping import SIGNALS, Stopped, is_asked, stop_if_asked
 from ..system.wording import quoted
@@ -345,7 +345,8 @@ def _import_ray() -> Any:
     try:
         import ray
     except ImportError as error:
-        raise InputError("--engine ray needs Ray: pip install 'msgs-slam[cluster]', on every node") from error
+        fix = install_command("msgs-slam[cluster]")
+        raise InputError(f"--engine ray needs Ray on every node: {fix}") from error
     return ray
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...formats.errors import InputError
+from ...formats.errors import InputError, install_command
 from ...formats.reading import file_sha256
 from ..compute.ssim import TAPS, similarity
 from ..networks.registry import Model, ModelStore
@@ -90,7 +90,8 @@ def _by_package() -> Lpips | str:
         import lpips
         from torchvision.models import AlexNet_Weights
     except ImportError:
-        return "needs the model lpips-alex (msgs-slam models pull --from FOLDER) or pip install 'msgs-slam[lpips]'"
+        package = install_command("msgs-slam[lpips]")
+        return f"needs its package ({package}) or the model lpips-alex: msgs-slam models pull --from FOLDER"
     except RuntimeError as error:  # torchvision of another build than torch
         return f"the package lpips cannot be loaded: {error}"
     weights = Path(torch.hub.get_dir()) / "checkpoints" / AlexNet_Weights.IMAGENET1K_V1.url.rsplit("/", 1)[1]

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.errors import InputError
+from ...formats.errors import InputError, install_command
 from ...formats.reading import opened, parsing, read_bytes
 from ..system.progress import log
 
@@ -105,7 +105,8 @@ def _open(path: Path, threads: int, device: str) -> Any:
 
     wanted = "CUDAExecutionProvider" if device == "cuda" else "CPUExecutionProvider"
     if wanted not in ort.get_available_providers():
-        log.warning("this onnxruntime has no CUDA: the network runs on the CPU (pip install onnxruntime-gpu)")
+        fix = install_command("onnxruntime-gpu")
+        log.warning("this onnxruntime has no CUDA: the network runs on the CPU. To use the card: %s", fix)
         wanted = "CPUExecutionProvider"
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...formats.errors import InputError
+from ...formats.errors import InputError, install_command
 from ...formats.reading import parsing, require_file
 from ...formats.tensors import load_arrays
 from .card import Card
@@ -138,8 +138,8 @@ def open_tokenizer(path: Path) -> Any:
         from tokenizers import Tokenizer
     except ImportError as error:
         raise InputError(
-            "a text encoder needs a package that is not here: pip install 'msgs-slam[words]'. Or give the card a table "
-            'of embeddings: text = "words.npz"'
+            f"a text encoder needs a package that is not here: {install_command('msgs-slam[words]')}. Or give the card "
+            'a table of embeddings: text = "words.npz"'
         ) from error
     require_file(path, _MAX_TOKENIZER_BYTES)
     try:

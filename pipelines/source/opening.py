@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.errors import InputError
+from ...formats.errors import InputError, install_command
 from ...formats.image_folder import list_images, read_image_times, times_file
 from ...formats.images import Reading, is_depth_map, read_rgb, read_transparent
 from ...formats.reading import file_sha256, files_sha256, opened, reaching, require_file
@@ -286,7 +286,8 @@ def _warn_of_the_file(path: Path, reader: VideoReader, warn: Warn) -> None:
     if reader.tone_mapped:
         warn(f"{path.name} is HDR ({reader.hdr}): tone-mapped to the range of ordinary images")
     elif reader.hdr:
-        warn(f"{path.name} is HDR ({reader.hdr}), its colours will look flat: pip install 'msgs-slam[hdr]' fixes that")
+        fix = install_command("msgs-slam[hdr]")
+        warn(f"{path.name} is HDR ({reader.hdr}), its colours will look flat. To read it in full: {fix}")
     # Containers count a frame or two too many in passing; that is no damage.
     if reader.missing_frames > max(2, reader.info.frame_count_claimed // 50):
         warn(

@@ -5,7 +5,7 @@ import os
 import shutil
 from pathlib import Path
 
-from ...formats.errors import InputError
+from ...formats.errors import InputError, install_command
 from .progress import log
 
 
@@ -32,10 +32,8 @@ def unused_card() -> tuple[str, str] | None:
     if torch.cuda.is_available() or not has_driver or os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1"):
         return None
     if torch.version.cuda is None:
-        fix = (
-            "install a CUDA build of torch that fits the driver (pytorch.org, Get started; on Linux pip install "
-            "--force-reinstall torch)"
-        )
+        command = install_command("--force-reinstall", "torch<2.14")
+        fix = f"install a CUDA build of torch that fits the driver (pytorch.org, Get started; on Linux: {command})"
         return "there is an NVIDIA driver, but torch is a CPU build: everything runs on the CPU", fix
     built = f"torch is built for CUDA {torch.version.cuda} and finds no device: everything runs on the CPU"
     return f"there is an NVIDIA driver, but {built}", "update the driver, or install a torch for its CUDA version"

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
-from ...formats.errors import InputError
+from ...formats.errors import InputError, install_command
 
 
 def is_welcome(host_header: str, origin: str | None, served_host: str) -> bool:
@@ -61,7 +61,8 @@ def guarding(served_host: str) -> Iterator[None]:
     finally:
         ws.serve = original  # type: ignore[misc, unused-ignore]
     if not used:
-        raise InputError("this version of viser cannot be guarded against other pages: pip install 'viser==1.1.1'")
+        fix = install_command("viser==1.1.1")
+        raise InputError(f"this version of viser cannot be guarded against other pages: {fix}")
 
 
 def _host(header: str) -> str | None:

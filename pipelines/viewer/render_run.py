@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from ...formats.errors import InputError
+from ...formats.errors import InputError, install_command
 from ...formats.gaussian_files import read_gaussians
 from ...formats.images import write_rgb
 from ...formats.video_writer import CODECS, PLAYED, write_browser_video, write_video
@@ -189,8 +189,8 @@ def _write(target: Path, pictures: Iterator[Picture], fps: float) -> Path:
         return write_video(target, pictures, fps)
     if (codec := write_browser_video(target, pictures, fps)) not in PLAYED:
         log.warning(
-            "%s is %s, which browsers do not play: nothing here writes H.264 or VP9. pip install 'msgs-slam[hdr]'",
-            target, codec,
+            "%s is %s, which browsers do not play: nothing here writes H.264 or VP9. %s",
+            target, codec, install_command("msgs-slam[hdr]"),
         )  # fmt: skip
     return target
 

@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from ...formats.errors import InputError
+from ...formats.errors import InputError, install_command
 from ...formats.mesh import read_mesh_ply
 from ..export.extra.floor_plan import walls_of_run
 from ..source.sharpness import at_most_wide
@@ -54,7 +54,7 @@ def open_viewer(path: Path, host: str = "127.0.0.1", port: int = 8080) -> Viewer
     try:
         import viser
     except ImportError as error:
-        raise InputError("the viewer needs viser: pip install 'msgs-slam[viewer]'") from error
+        raise InputError(f"the viewer needs viser: {install_command('msgs-slam[viewer]')}") from error
     try:
         with guarding(host):
             server = viser.ViserServer(host=host, port=port, label=f"MSGS-SLAM {plain(scenes[0].title)}", verbose=False)

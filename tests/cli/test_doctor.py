@@ -1,6 +1,9 @@
 """The examination of a machine: what is well, and what it says of what is not."""
 
+import importlib.util
+import shlex
 import shutil
+import sys
 from collections import namedtuple
 from pathlib import Path
 
@@ -8,6 +11,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 
+from msgs_slam.formats.errors import install_command
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines import doctor
 from msgs_slam.pipelines.doctor import BAD, GOOD, NOTE, Finding, examine
@@ -43,6 +47,20 @@ def test_what_is_missing_is_said_with_its_fix(tmp_path: Path, monkeypatch: pytes
     assert findings["threads"].state == NOTE
     assert findings["disk"].state == BAD
     assert "0.1 GB" in findings["disk"].text
+
+
+@pytest.mark.parametrize(("has_pip", "words"), [(True, "-m pip install"), (False, "uv pip install --python")])
+def test_commands_install_beside_this_program(has_pip: bool, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever environment the shell is in; `uv tool` makes some without pip."""
+    monkeypatch.setattr(sys, "executable", "/opt/my tools/bin/python")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if has_pip else None)
+    command = install_command("msgs-slam[viewer]", "torch<3")
+    assert words in command
+    split = shlex.split(command)
+    assert "/opt/my tools/bin/python" in split
+    assert split[-2:] == ["msgs-slam[viewer]", "torch<3"]
+    viewer = found("viewer", Path("."))
+    assert viewer.fix in ("", install_command("msgs-slam[viewer]"))
 
 
 def test_a_check_that_breaks_is_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

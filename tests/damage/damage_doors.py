@@ -40,11 +40,11 @@ from msgs_slam.formats.image_folder import (
     read_image_times,
 )
 from msgs_slam.formats.images import (
-    exif_focal_px,
     exif_time,
     image_size,
     read_depth_png,
     read_grey_png,
+    read_header,
     read_label_png,
     read_rgb,
     write_grey_png,
@@ -159,7 +159,7 @@ def tum(path: Path) -> None:
 
 
 def picture(path: Path) -> None:
-    read_any(path, read_rgb, image_size, exif_time, lambda p: exif_focal_px(p, WIDTH, HEIGHT))
+    read_any(path, read_rgb, image_size, exif_time, lambda p: read_header(p).lens.focal_px(WIDTH, HEIGHT))
 
 
 def maps(path: Path) -> None:

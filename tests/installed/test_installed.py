@@ -60,7 +60,8 @@ def succeeds(here: Path, *arguments: object) -> str:
 @pytest.fixture(scope="module")
 def demo(here: Path) -> Path:
     """A finished run of the built-in clip, by the command for it."""
-    succeeds(here, "demo", *(word for setting in SMALL for word in ("--set", setting)), "-q")
+    said = succeeds(here, "demo", *(word for setting in SMALL for word in ("--set", setting)), "-q")
+    (here / "said.txt").write_text(said)
     return here / "msgs-demo" / "room.msgs"
 
 
@@ -124,6 +125,15 @@ def test_the_demo_ends_with_every_file(demo: Path) -> None:
     assert {FILES[n] for n in ("colmap", "ply", "mesh", "tum")} <= written
     mesh = trimesh.load(demo / "export" / "mesh.ply", process=False)
     assert len(mesh.faces) > 1000
+
+
+def test_the_demo_ends_with_three_next_commands_that_can_be_pasted(demo: Path) -> None:
+    said = (demo.parents[1] / "said.txt").read_text()
+    lines = [line.split("#")[0].split() for line in said.split("Next:\n")[1].splitlines()]
+    assert [words[1] for words in lines] == ["view", "report", "reconstruct"]
+    assert lines[0][2] == "msgs-demo/room.msgs"
+    for words in lines:
+        assert shutil.which(words[0]), "by its path where it is not on the PATH"
 
 
 def test_a_finished_run_is_up_to_date(demo: Path) -> None:
