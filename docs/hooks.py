@@ -14,7 +14,7 @@ from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.pipelines.config import Config, allowed_values, config_to_dict
+from msgs_slam.pipelines.config import Config, allowed_values, config_to_dict, meaning_of
 
 _MATHS = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
@@ -80,6 +80,6 @@ def settings_page() -> str:
         defaults = config_to_dict(values)
         for f in fields(values):
             may_be = allowed_values(f) or _ANY[f.type.__name__]
-            cells = (f"`{f.name}`", f"`{defaults[f.name]!r}`", may_be, f.metadata["help"])
+            cells = (f"`{f.name}`", f"`{defaults[f.name]!r}`", may_be, meaning_of(f))
             parts.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(parts) + "\n"

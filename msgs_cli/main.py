@@ -30,6 +30,7 @@ from .options import (
     engine_options,
     hold_out_option,
     open_run,
+    quality_option,
     settings_options,
     source_options,
 )
@@ -189,6 +190,7 @@ def reconstruct(
     help="Make this stage and those after it again, with the networks that are installed now; run.toml stays.",
 )  # fmt: skip
 @settings_options
+@quality_option
 @device_option
 @UNTIL
 @engine_options("local: all in this process; ray: keyframes' depths and submaps on the nodes of a cluster.")

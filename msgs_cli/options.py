@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 RUN_ARGUMENT = click.argument("run_path", metavar="RUN", type=click.Path(path_type=Path))
-_HOLD_OUT = "mapping.hold_out"
+_HOLD_OUT, _QUALITY = "mapping.hold_out", "run.quality"
 UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], help="Stop after this stage.")
 
 
@@ -95,6 +95,7 @@ def source_options(command: Callable[..., None]) -> Callable[..., None]:
 
 hold_out_option = setting_option(_HOLD_OUT)
 device_option = setting_option("run.device")
+quality_option = setting_option(_QUALITY)
 
 
 def chosen_config(
@@ -110,10 +111,11 @@ def chosen_config(
     """
     from ..pipelines.read_config import load_config, merge_settings
 
-    config = load_config(file, overrides, base)
+    quality = given.get("run__quality")
+    config = load_config(file, overrides, base, None if quality is None else str(quality))
     for key, known in settings_with_options().items():
         section, _, name = key.partition(".")
-        if (value := given.get(f"{section}__{name}")) is not None:
+        if key != _QUALITY and (value := given.get(f"{section}__{name}")) is not None:
             config = merge_settings(config, {section: {name: value}}, f"--{known.metadata['option'].name}")
     return config
 

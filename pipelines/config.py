@@ -31,6 +31,8 @@ def setting(
     or_zero: bool = False,
     paths: tuple[str, ...] = (),
     option: Option | None = None,
+    draft: Any = None,
+    best: Any = None,
 ) -> Any:
     """A dataclass field that carries all that is known of it.
 
@@ -42,11 +44,13 @@ def setting(
         or_zero: whether it may be 0 beside these.
         paths: what stands before the path of a file or folder that it may name, "" where it is the path alone.
         option: of the command line.
+        draft: its value with `run.quality` at draft, where that is another one; `best` likewise.
     """
     return field(
         default=default,
         metadata={
             "help": help, "choices": choices, "within": within, "or_zero": or_zero, "paths": paths, "option": option,
+            "draft": draft, "best": best,
         },
     )  # fmt: skip
 
@@ -55,6 +59,16 @@ def setting(
 class RunConfig:
     """Settings of the whole run."""
 
+    quality: str = setting(
+        "normal", "other values of the settings that say so; what is set besides stays. In a run: resume RUN --quality",
+        ("draft", "normal", "best"),
+        option=Option(
+            "quality",
+            help="draft: a third of the time or less, fewer keyframes and smaller images; best: larger images, more "
+            "passes, the largest networks that are installed, a textured mesh. Options and settings that are given "
+            "besides win. Default: normal.",
+        ),
+    )  # fmt: skip
     seed: int = setting(0, "seed of every random choice", within=(0, 2**31 - 1))
     threads: int = setting(0, "CPU threads, 0 = all cores; the same count gives the same bytes", within=(0, 1024))
     format: str = setting(
@@ -90,7 +104,9 @@ class FramesConfig:
         within=(0.1, 1000),
         or_zero=True,
     )
-    max_side: int = setting(960, "longer images are reduced to this many pixels on the long side", within=(64, 8192))
+    max_side: int = setting(
+        960, "longer images are reduced to this many pixels on the long side", within=(64, 8192), draft=640, best=1280
+    )
     intrinsics: str = setting(
         "", "fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file; empty = find them",
         paths=("",),
@@ -122,10 +138,15 @@ class FramesConfig:
         "auto", "seconds from a frame's first row to its last; auto finds them, where they explain something; off"
     )
     parallax: float = setting(
-        0.025, "a new keyframe when points have moved by this fraction of the image width", within=(0.001, 0.5)
+        0.025,
+        "a new keyframe when points have moved by this fraction of the image width",
+        within=(0.001, 0.5),
+        draft=0.045,
     )
     features: str = setting("sift", "sift; aliked, with LightGlue, needs networks of 49 MB", ("sift", "aliked"))
-    max_features: int = setting(3000, "features of a keyframe, at most about this many", within=(50, 100_000))
+    max_features: int = setting(
+        3000, "features of a keyframe, at most about this many", within=(50, 100_000), draft=2000
+    )
     overlap: int = setting(
         8, "each keyframe is matched with this many after it (and a few further ones)", within=(1, 1000)
     )
@@ -157,13 +178,14 @@ class ProxyConfig:
     """Proxy depth and semantics of every keyframe."""
 
     depth: str = setting(
-        "auto", "depth provider: auto, multiview, files[:FOLDER], onnx:CARD, a network's name",
+        "auto", "depth provider: auto, best (the largest network that is installed), multiview, files[:FOLDER], "
+        "onnx:CARD, a network's name",
         paths=("files:", "onnx:"),
         option=Option(
             "depth", "PROVIDER",
-            "Proxy depth: auto, multiview (needs no weights), files[:FOLDER], onnx:CARD, or a network by its name "
-            "in `models list`. Default: auto.",
-        ),
+            "Proxy depth: auto, best (the largest network that is installed), multiview (needs no weights), "
+            "files[:FOLDER], onnx:CARD, or a network by its name in `models list`. Default: auto.",
+        ), best="best",
     )  # fmt: skip
     semantics: str = setting(
         "auto", "semantics provider: auto, segments, files[:FOLDER], onnx:CARD, a network's name",
@@ -183,7 +205,9 @@ class ProxyConfig:
         ),
     )  # fmt: skip
     frames: str = setting("keyframes", "which frames get maps; all needs depth without poses", ("keyframes", "all"))
-    max_side: int = setting(640, "the maps are at most this many pixels on the long side", within=(64, 8192))
+    max_side: int = setting(
+        640, "the maps are at most this many pixels on the long side", within=(64, 8192), draft=320, best=960
+    )
     depth_scale: float = setting(0.001, "metres per unit of integer depth files", within=(1e-9, 1000))
     scale_ref: str = setting(
         "",
@@ -201,8 +225,10 @@ class ProxyConfig:
         "which depth is fused with multi-view depth: a network's, and files no better than one; all; or none",
         ("learned", "always", "never"),
     )
-    stereo_side: int = setting(640, "multiview matches images of this many pixels on the long side", within=(32, 4096))
-    stereo_planes: int = setting(128, "multiview tries this many depths", within=(4, 1024))
+    stereo_side: int = setting(
+        640, "multiview matches images of this many pixels on the long side", within=(32, 4096), draft=320, best=960
+    )
+    stereo_planes: int = setting(128, "multiview tries this many depths", within=(4, 1024), draft=64)
     moving: str = setting("auto", "auto leaves out what moved, by depth and poses; keep maps it", ("auto", "keep"))
     max_classes: int = setting(16, "segments and clusters make at most this many classes", within=(1, 254))
 
@@ -223,6 +249,8 @@ class MappingConfig:
         "longer keyframes are mapped at this many pixels on the long side; 0 = as they are",
         within=(16, 8192),
         or_zero=True,
+        draft=320,
+        best=960,
     )
     hold_out: int = setting(
         0,
@@ -235,8 +263,10 @@ class MappingConfig:
         ),
     )  # fmt: skip
     seed_stride: int = setting(2, "pixels between two new Gaussians where the map has a hole", within=(1, 64))
-    passes: float = setting(9.0, "how often each keyframe is visited once all are seeded", within=(0, 1000))
-    min_iterations: int = setting(400, "at least this many such visits in all", within=(0, 10_000_000))
+    passes: float = setting(
+        9.0, "how often each keyframe is visited once all are seeded", within=(0, 1000), draft=6.0, best=14.0
+    )
+    min_iterations: int = setting(400, "at least this many such visits in all", within=(0, 10_000_000), draft=150)
     snapshot_every: int = setting(150, "steps between two snapshots", within=(1, 1_000_000))
     max_gaussians: int = setting(1000000, "the map, or each submap, grows to this many", within=(100, 50_000_000))
     submap: int = setting(
@@ -286,12 +316,16 @@ class ExportConfig:
             "time, lat, lon, alt (a video counts from its start). Default: auto, the images' EXIF; off for neither.",
         ),
     )  # fmt: skip
-    voxel: float = setting(0.008, "voxel of the mesh, in units of the scene's median depth", within=(0.0005, 1))
+    voxel: float = setting(
+        0.008, "voxel of the mesh, in units of the scene's median depth", within=(0.0005, 1), draft=0.014
+    )
     max_blocks: int = setting(
         80000, "blocks of 8 x 8 x 8 voxels for 200 keyframes, more for more; voxels grow where that is too few",
         within=(10, 10_000_000),
     )  # fmt: skip
-    mesh_side: int = setting(640, "pixels on the long side of their depth images", within=(16, 8192))
+    mesh_side: int = setting(
+        640, "pixels on the long side of their depth images", within=(16, 8192), draft=320, best=960
+    )
     planes: bool = setting(
         True, "the mesh's floors, walls and fronts straight: what no match confirms moves onto the planes beside it"
     )
@@ -309,7 +343,7 @@ class ExportConfig:
     spz_version: int = setting(4, "version of that file; 3 for older readers", within=(3, 4))
     splat_glb: bool = setting(False, "write the map as point_cloud.glb too (glTF, KHR_gaussian_splatting)")
     sh_rest: bool = setting(False, "the splat PLYs hold f_rest_0 to 44 too, all zero, for readers that insist on them")
-    texture: bool = setting(False, "write a lighter mesh with a texture of photographs too: mesh_textured.*")
+    texture: bool = setting(False, "write a lighter mesh with a texture of photographs too: mesh_textured.*", best=True)
 
 
 @dataclass(frozen=True)
@@ -328,6 +362,19 @@ class Config:
 def allowed_values(known: Field[Any]) -> str:
     """Describe the allowed values of a setting; "" where every value of its type is allowed."""
     return " | ".join(known.metadata["choices"]) or (range_text(known) if known.metadata["within"] else "")
+
+
+def value_of(known: Field[Any], quality: str) -> Any:
+    """Return what a setting is with `run.quality` at `quality`."""
+    value = known.metadata.get(quality)
+    return known.default if value is None else value
+
+
+def meaning_of(known: Field[Any]) -> str:
+    """Return a setting's help, with its values at draft and best where these are others."""
+    of = {quality: known.metadata[quality] for quality in ("draft", "best")}
+    others = ", ".join(f"{quality} {value}" for quality, value in of.items() if value is not None)
+    return known.metadata["help"] + (f" [{others}]" if others else "")
 
 
 def range_text(known: Field[Any]) -> str:

@@ -16,28 +16,60 @@ from typing import Any, get_type_hints
 from ..formats.errors import SettingError
 from ..formats.reading import home_expanded, is_unicode
 from ..formats.textfile import read_toml
-from .config import Config, allowed_values, range_text
+from .config import Config, allowed_values, meaning_of, range_text, value_of
 
 
 class UnknownSettingError(SettingError):
     """There is no setting of that name."""
 
 
-def load_config(file: Path | None = None, overrides: Iterable[str] = (), base: Config | None = None) -> Config:
+def load_config(
+    file: Path | None = None, overrides: Iterable[str] = (), base: Config | None = None, quality: str | None = None
+) -> Config:
     """The settings of `base` (or the defaults), changed by a TOML file and then by `section.key=value` texts.
 
+    A `quality` (of --quality; else run.quality of a text, else of the file) changes first what it has another value
+    for and nobody has chosen; what else is in the file and the texts is laid over that. A file that says its quality,
+    as one that `msgs-slam config` prints, is taken as a whole for what --quality or a text then changes.
     Raises InputError for an unreadable file, an unknown key (with the nearest known one) or a value of a wrong type.
     """
-    config = base or Config()
-    if file is not None:
-        config = merge_settings(config, read_toml(file), str(file))
-    for text in overrides:
-        key, separator, value = text.partition("=")
-        section, dot, name = key.strip().partition(".")
-        if not separator or not dot:
-            raise SettingError(f"--set {text}: expected section.key=value, for example --set frames.rate=5")
-        config = merge_settings(config, {section: {name: _parse_value(value.strip())}}, f"--set {text}")
+    config, texts = base or Config(), [_override(text) for text in overrides]
+    values = {} if file is None else read_toml(file)
+    asked = [(change["run"]["quality"], source) for change, source in texts if "quality" in change.get("run", {})]
+    asked += [(quality, "--quality")] if quality is not None else []
+    of_file = run.get("quality") if isinstance(run := values.get("run"), Mapping) else None
+    if of_file is not None:
+        config = merge_settings(with_quality(config, of_file, str(file)), values, str(file))
+    for wanted, source in asked:
+        config = with_quality(config, wanted, source)
+    if of_file is None:
+        config = merge_settings(config, values, str(file))
+    for change, source in texts:
+        config = config if "quality" in change.get("run", {}) else merge_settings(config, change, source)
     return config
+
+
+def _override(text: str) -> tuple[dict[str, dict[str, Any]], str]:
+    """What `section.key=value` changes, and how an error names it."""
+    key, separator, value = text.partition("=")
+    section, dot, name = key.strip().partition(".")
+    if not separator or not dot:
+        raise SettingError(f"--set {text}: expected section.key=value, for example --set frames.rate=5")
+    return {section: {name: _parse_value(value.strip())}}, f"--set {text}"
+
+
+def with_quality(config: Config, quality: Any, source: str) -> Config:
+    """Give every setting its value of a quality; one that differs from its value of the present quality is somebody's
+    choice and stays. Raises SettingError, which names the `source`, for no quality."""
+    before = config.run.quality
+    config = merge_settings(config, {"run": {"quality": quality}}, source)
+    sections = {f.name: getattr(config, f.name) for f in fields(config)}
+    for name, values in sections.items():
+        changed = {
+            f.name: value_of(f, quality) for f in fields(values) if getattr(values, f.name) == value_of(f, before)
+        }
+        sections[name] = replace(values, **changed | ({"quality": quality} if name == "run" else {}))
+    return Config(**sections)
 
 
 def merge_settings(config: Config, changes: Mapping[str, Any], source: str) -> Config:
@@ -114,7 +146,7 @@ def config_to_toml(config: Config) -> str:
         lines.append(f"[{section.name}]")
         for f in fields(values):
             allowed = allowed_values(f)
-            lines.append(f"# {f.metadata['help']}" + (f" ({allowed})" if allowed else ""))
+            lines.append(f"# {meaning_of(f)}" + (f" ({allowed})" if allowed else ""))
             lines.append(f"{f.name} = {toml_value(getattr(values, f.name))}")
         lines.append("")
     return "\n".join(lines)

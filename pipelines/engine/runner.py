@@ -29,10 +29,9 @@ from .staleness import (
     rerun_reason,
     stage_fingerprint,
 )
+from .time_left import TimeLeft, work_of
 
 _PROCESS = Path("/proc/self")
-_SHARES = {"frames": 16, "proxy": 33, "tracking": 5, "mapping": 37, "global_ba": 1, "export": 8}
-"""Per cent of the whole: the median of five recordings (kitchen, whiteroom, the demo, walks of 15 and 60 s)."""
 
 
 def run_stages(
@@ -67,7 +66,8 @@ def run_stages(
     if run.manifest() is None:
         write_manifest(run.manifest_file, Manifest(origin, records))
     save_settings(run, config)
-    reporter = StageReporter(progress, wanted, records)
+    settled = replace(config, run=replace(config.run, threads=config.run.threads or threads))
+    reporter = StageReporter(progress, wanted, records, settled)
     for stage in wanted:
         record = records.get(stage.name)
         why = "" if record is None else rerun_reason(stage, run, record, config, upstream, inputs[stage.name])
@@ -79,7 +79,6 @@ def run_stages(
             if _drop(records, stage.name):
                 write_manifest(run.manifest_file, Manifest(origin, records))
             folder = run.partial(stage.name)
-            settled = replace(config, run=replace(config.run, threads=config.run.threads or threads))
             context = StageContext(run, source, settled, folder, progress, [], stages, same_source, workers)
             with reporter.running(stage.name) as ended:
                 sealed = _find_ended(stage, run, config, fingerprint) if record is None else None
@@ -101,16 +100,22 @@ def run_stages(
 class StageReporter:
     """Reports the stages as they begin and end, and how long the rest will take."""
 
-    def __init__(self, progress: Progress, wanted: Sequence[Stage], records: Mapping[str, StageRecord]) -> None:
+    def __init__(
+        self, progress: Progress, wanted: Sequence[Stage], records: Mapping[str, StageRecord], config: Config
+    ) -> None:
         self._progress, self._names = progress, [stage.name for stage in wanted]
-        done = {name: records[name].seconds for name in self._names if name in records}
-        self._left = TimeLeft(self._names, done)
+        self._records, self._config = records, config
+        self._left = TimeLeft({name: records[name].seconds for name in self._names if name in records}, self._names)
 
     def report(self, name: str, state: str, record: StageRecord | None = None) -> None:
         """Report that a stage has come into a state."""
         index, figures = self._names.index(name) + 1, record.figures if record else {}
-        seconds = record.seconds if record else 0.0
-        self._progress.stage(StageEvent(name, index, len(self._names), state, seconds, figures, self._left.left))
+        seconds, of_work = record.seconds if record else 0.0, ""
+        if name == STAGES[0] and state in (ENDED, UP_TO_DATE):  # what there is to do is known from here on
+            self._left.work = work_of(self._config, (record or self._records[name]).figures)
+            of_work = self._left.work.text
+        left = self._left.left
+        self._progress.stage(StageEvent(name, index, len(self._names), state, seconds, figures, left, of_work))
 
     @contextmanager
     def running(self, name: str) -> Iterator[Callable[[StageRecord], None]]:
@@ -237,35 +242,3 @@ def peak_memory_mb() -> float:
         return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) / 1024
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)
-
-
-class TimeLeft:
-    """Time left for the stages `wanted`, in order: `seconds` of those that are done, by this process or another, tell
-    how fast it goes here. Right to a factor of about two; as long as no stage is done nothing is known."""
-
-    def __init__(self, wanted: Sequence[str], seconds: Mapping[str, float]) -> None:
-        self._wanted, self._seconds = list(wanted), dict(seconds)
-        self._waiting: list[str] = []
-        self._begun: float | None = None
-
-    def begin(self, name: str) -> None:
-        """Note that this stage begins: it and those after it are to be made."""
-        self._waiting, self._begun = self._wanted[self._wanted.index(name) :], time.monotonic()
-        self._seconds = {k: v for k, v in self._seconds.items() if k not in self._waiting}
-
-    def end(self, name: str, seconds: float) -> None:
-        """Note that this stage has ended."""
-        self._seconds[name], self._begun = seconds, None
-        self._waiting.remove(name)
-
-    def left(self) -> float | None:
-        """Seconds to the end of all, by the time that it is now; None where nothing is known."""
-        done = sum(_SHARES[name] for name in self._seconds)
-        if not done:
-            return None
-        a_share = sum(self._seconds.values()) / done
-        expected = [a_share * _SHARES[name] for name in self._waiting]
-        if self._begun is not None:
-            # A stage that takes longer than estimated has still some of its time to go.
-            expected[0] = max(expected[0] - (time.monotonic() - self._begun), 0.1 * expected[0])
-        return sum(expected)

@@ -298,6 +298,9 @@ def _require_all(context: StageContext, source: AnySource, frames: list[Frame]) 
 def _figures(frames: list[Frame], structure: Structure, calibration: Calibration) -> dict[str, Any]:
     report = structure.report
     return {
+        "images": frames[-1].source_index + 1,
+        "width": calibration.intrinsics.width,
+        "height": calibration.intrinsics.height,
         "frames": len(frames),
         "keyframes": report.total,
         "keyframes_placed": report.registered,

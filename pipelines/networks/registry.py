@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -105,11 +105,14 @@ class ModelStore:
     def first_here(self, task: str, metres_only: bool = False) -> Model | None:
         """The best model of a task whose file is in the cache; with `metres_only` also one that is good for nothing
         but the scale."""
+        return next(self.all_here(task, metres_only), None)
+
+    def all_here(self, task: str, metres_only: bool = False) -> Iterator[Model]:
+        """Every model of a task whose file is in the cache, best first, as `first_here` counts them."""
         for model in self.models:
             family = self.families[model.family]
             if family["task"] == task and self.is_here(model) and (metres_only or not family.get("metres_only")):
-                return model
-        return None
+                yield model
 
     def first_metric(self) -> Model | None:
         """The best network for metric depth in the cache: by itself, or as its training camera saw them."""

@@ -17,6 +17,7 @@ from ..system.progress import SilentProgress, log
 from ..types import Calibration, Frame, Intrinsics
 from .reference import POSES, require_reference_in
 from .selection import (
+    AUTO,
     ProviderContext,
     choose_depth,
     choose_semantics,
@@ -47,7 +48,7 @@ def proxy_inputs(source: Path, config: Config) -> dict[str, Any]:
 def left_to_auto(config: Config) -> tuple[str, ...]:
     """Which of them the networks in the cache decide."""
     asked = {"depth": config.proxy.depth, "labels": config.proxy.semantics}
-    return tuple(name for name, text in asked.items() if text.partition(":")[0].strip() == "auto")
+    return tuple(name for name, text in asked.items() if text.partition(":")[0].strip() in AUTO)
 
 
 def check_proxy(source: Path, config: Config) -> None:

@@ -30,6 +30,8 @@ LEARNED_SPREAD = 0.02
 """Files whose depths stray by more from the triangulated points, relatively and within one frame, are taken for a
 network's. Measured: true depth 0.004, two models of a network 0.056 and 0.059."""
 _FILES_LOOKED_AT = 12
+AUTO = ("auto", "best")
+"""Words that leave it to the networks in the cache: the first of the table, or the largest."""
 
 
 @dataclass(frozen=True)
@@ -101,11 +103,11 @@ def choose_semantics(config: ProxyConfig) -> Choice:
 
 
 def _choose(text: str, setting: str, own: tuple[str, ...], task: str) -> Choice:
-    kind, rest = split_choice(text, setting, ("auto", *own, "files", "onnx"))
-    card = _cached(task) if kind == "auto" else _read(rest) if kind == "onnx" else None
+    kind, rest = split_choice(text, setting, (*AUTO, *own, "files", "onnx"))
+    card = _cached(task, kind == "best") if kind in AUTO else _read(rest) if kind == "onnx" else None
     if card is not None:
         return Choice("onnx", card=card)
-    return Choice("files", rest) if kind == "files" else Choice(own[0] if kind == "auto" else kind)
+    return Choice("files", rest) if kind == "files" else Choice(own[0] if kind in AUTO else kind)
 
 
 def open_depth(around: ProviderContext) -> DepthProvider:
@@ -190,10 +192,11 @@ def _read(text: str) -> Card:
     return store.card(model)
 
 
-def _cached(task: str) -> Card | None:
-    """The card of the best learned model whose weights are in the cache; nothing is ever downloaded here."""
+def _cached(task: str, largest: bool) -> Card | None:
+    """The card of the first learned model whose weights are in the cache, or of the one of the largest weights; nothing
+    is ever downloaded here."""
     store = ModelStore.open()
-    model = store.first_here(task)
+    model = max(store.all_here(task), key=lambda m: m.bytes, default=None) if largest else store.first_here(task)
     return None if model is None else store.card(model)
 
 

@@ -21,7 +21,7 @@ def _unknown() -> None:
 class StageEvent:
     """Stage number `index` of `of` has come into a state: begun, done, up to date (nothing to do), stopped by a signal,
     failed. seconds and figures of one that is done; left: seconds to the end of all of them at the moment of asking,
-    None where nothing is known."""
+    None where nothing is known; of_work: how much there is to do, in words, once that is known."""
 
     name: str
     index: int
@@ -30,6 +30,7 @@ class StageEvent:
     seconds: float = 0.0
     figures: Mapping[str, Any] = field(default_factory=dict)
     left: Callable[[], float | None] = _unknown
+    of_work: str = ""
 
     @property
     def title(self) -> str:
@@ -38,9 +39,10 @@ class StageEvent:
 
     @property
     def left_text(self) -> str:
-        """; about 4 min left, or nothing."""
+        """; about 4 min left, and for what: 46 keyframes at 640 px; or nothing."""
         seconds = self.left()
-        return f"; {about(seconds)} left" if seconds else ""
+        for_what = f" on this machine: {self.of_work}" if self.of_work else ""
+        return f"; {about(seconds)} left{for_what}" if seconds else ""
 
 
 def about(seconds: float) -> str:

@@ -146,3 +146,37 @@ def test_every_number_has_a_range_around_its_default_that_config_shows() -> None
                 with pytest.raises(InputError, match=f"{name} is {low:.10g} to {high:.10g}".replace(".", r"\.")):
                     load_config(overrides=[f"{name}={value if isinstance(known.default, float) else int(value)}"])
             assert f"{low:.10g} to {high:.10g}" in shown
+
+
+def test_a_quality_is_a_set_of_values_that_what_is_given_besides_wins_over(tmp_path: Path) -> None:
+    normal, draft = Config(), load_config(quality="draft")
+    assert draft == load_config(overrides=["run.quality=draft"]) == chosen_config(None, (), {"run__quality": "draft"})
+    assert draft.run.quality == "draft"
+    assert draft.mapping.passes < normal.mapping.passes
+    assert draft.proxy.stereo_side < normal.proxy.stereo_side
+    # In whatever order they are given, and where they say what would be normal.
+    for words in (["run.quality=draft", "mapping.passes=9"], ["mapping.passes=9", "run.quality=draft"]):
+        assert load_config(overrides=words).mapping == dataclasses.replace(draft.mapping, passes=9.0)
+    given = chosen_config(None, ["frames.max_side=960"], {"run__quality": "draft", "proxy__depth": "multiview"})
+    assert (given.frames.max_side, given.proxy.stereo_side) == (960, draft.proxy.stereo_side)
+    file = tmp_path / "settings.toml"
+    file.write_text('[mapping]\npasses = 9\n[run]\nquality = "draft"\n')
+    assert load_config(file).mapping.passes == 9
+    assert load_config(file).frames == draft.frames
+    file.write_text("[mapping]\npasses = 9\n")
+    assert load_config(file, quality="draft").mapping.passes == 9
+    # A file of all settings is no choice of each of them.
+    file.write_text(config_to_toml(load_config(overrides=["frames.rate=7"])))
+    assert load_config(file, quality="draft") == load_config(overrides=["frames.rate=7"], quality="draft")
+
+
+def test_a_run_remembers_its_quality_and_changes_it(tmp_path: Path) -> None:
+    draft = load_config(overrides=["frames.parallax=0.06"], quality="draft")
+    kept = load_config(base=draft)
+    assert kept == draft
+    best = load_config(base=draft, quality="best")
+    assert best == load_config(overrides=["frames.parallax=0.06"], quality="best")
+    assert best.proxy.depth == "best"
+    assert load_config(base=best, quality="normal") == load_config(overrides=["frames.parallax=0.06"])
+    with pytest.raises(InputError, match=r"--quality is one of draft, normal, best; got 'high'"):
+        load_config(quality="high")

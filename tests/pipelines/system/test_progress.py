@@ -7,7 +7,9 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from msgs_slam.msgs_cli.progress import BarProgress
-from msgs_slam.pipelines.engine.runner import TimeLeft
+from msgs_slam.pipelines.config import Config, RunConfig
+from msgs_slam.pipelines.engine.time_left import USUAL, TimeLeft, work_of
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.system.progress import (
     BEGUN,
     ENDED,
@@ -27,7 +29,7 @@ def event(state: str, left: Callable[[], float | None] = lambda: 240.0) -> Stage
 def test_time_left_follows_what_stages_have_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
-    left = TimeLeft(("frames", "proxy", "tracking", "mapping", "global_ba", "export"), {})
+    left = TimeLeft({}, ("frames", "proxy", "tracking", "mapping", "global_ba", "export"))
     left.begin("frames")
     assert left.left() is None, "nothing is known of this machine yet"
     left.end("frames", 16.0)
@@ -39,10 +41,27 @@ def test_time_left_follows_what_stages_have_taken(monkeypatch: pytest.MonkeyPatc
     assert left.left() == pytest.approx(84.0 - 33.0 + 3.3), "late, and not over yet"
     left.end("proxy", 66.0)
     assert left.left() == pytest.approx(51.0 * 82 / 49), "slower than thought, so is the rest"
-    resumed = TimeLeft(("frames", "proxy", "tracking"), {"frames": 32.0, "proxy": 66.0, "tracking": 10.0})
+    resumed = TimeLeft({"frames": 32.0, "proxy": 66.0, "tracking": 10.0}, ("frames", "proxy", "tracking"))
     assert resumed.left() == 0
     resumed.begin("proxy")
     assert resumed.left() == pytest.approx(2 * (33 + 5)), "what is made again does not count as done"
+
+
+def test_work_grows_with_what_there_is_to_do() -> None:
+    figures = {"images": 300, "frames": 100, "keyframes": 46, "width": 640, "height": 480}
+    one = Config(run=RunConfig(threads=1, device="cpu"))
+    four = load_config(overrides=["run.threads=4"], base=one)
+    usual = work_of(one, figures)
+    assert usual.text == "46 keyframes at 640 px"
+    draft = work_of(load_config(base=one, quality="draft"), figures)
+    assert draft.text == "46 keyframes at 320 px"
+    for name, seconds in usual.seconds.items():
+        assert 0 < draft.seconds[name] <= seconds
+        assert 0.4 * seconds < work_of(four, figures).seconds[name] < seconds
+        assert work_of(one, figures | {"keyframes": 92, "frames": 200, "images": 600}).seconds[name] > 1.7 * seconds
+    assert work_of(one, {"keyframes": 46}) == USUAL, "a run of an earlier version"
+    said = StageEvent("frames", 1, 6, ENDED, 60.0, {}, lambda: 360.0, usual.text)
+    assert said.left_text == "; about 6 min left on this machine: 46 keyframes at 640 px"
 
 
 def test_words_for_a_time() -> None:
