@@ -22,7 +22,7 @@ KEY_FIGURES = {
     "proxy": ("depth", "semantics", "metric", "metres_per_unit", "classes"),
     "tracking": ("posed", "keyframes", "lost", "scale"),
     "mapping": ("gaussians", "keyframe_psnr"),
-    "global_ba": ("loops", "images_posed"),
+    "global_ba": ("loops", "images_posed", "keyframe_psnr"),
     "export": ("images", "vertices", "faces", "up", "floor", "gps"),
 }
 """What a person wants to know first; `status -v` says all."""

@@ -17,6 +17,7 @@ from ..formats.images import VIDEO_SUFFIXES
 from ..formats.textfile import write_json
 from .config import STAGES, Config
 from .engine.placement import Command, Placement
+from .outcome import keyframe_psnr
 from .reconstruct import existing_config, reconstruct
 from .run.folder import RunFolder, load_records
 from .run.lock import RunBusyError
@@ -27,7 +28,7 @@ _MOST_NAMED = 5
 _NOT_LISTED = (".", "__MACOSX")
 """How names begin that nobody gave: hidden files, and what macOS adds to an archive."""
 DONE, FAILED, ELSEWHERE, UNFINISHED, NOT_YET = "done", "failed", "in another process", "unfinished", "not yet"
-_FIGURES = (("frames", "frames"), ("tracking", "posed"), ("tracking", "keyframes"), ("mapping", "keyframe_psnr"))
+_FIGURES = (("frames", "frames"), ("tracking", "posed"), ("tracking", "keyframes"))
 
 
 @dataclass(frozen=True)
@@ -176,6 +177,7 @@ def table_row(recording: Recording) -> dict[str, Any]:
         if stage in records:
             row[name] = records[stage].figures.get(name)
     if records:
+        row["keyframe_psnr"] = keyframe_psnr(records)
         row["seconds"] = round(sum(r.seconds for r in records.values()), 1)
         row["peak_mb"] = round(max(r.peak_memory_mb for r in records.values()))
         row["warnings"] = sum(len(r.warnings) for r in records.values())

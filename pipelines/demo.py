@@ -77,22 +77,22 @@ def run_demo(
     video, truth = unpack_demo_clip(folder, clip)
     run = RunFolder(folder / RUN)
     reconstruct(video, run)
-    figures = write_evaluation(run, open_sequence(truth), progress, max_views=10)
+    figures = write_evaluation(run, open_sequence(truth), progress)
     return DemoResult(video, truth, run, figures, evaluation_table(figures))
 
 
 def demo_summary(result: DemoResult) -> list[str]:
     """A few lines for a person: the errors, and where to look."""
     figures = result.figures
-    frames, trajectory, images = figures["frames"], figures["trajectory"], figures["images"]
+    frames, trajectory = figures["frames"], figures["trajectory"]
     lines = [f"{frames['posed']} of {frames['picked']} frames posed"]
     if "missing" in trajectory:
         lines.append(f"no trajectory error: {trajectory['missing']}")
     else:
         rmse = trajectory["sim3 all"].get("rmse")
         lines.append(f"camera path: {100 * rmse:.2f} cm RMSE after Sim(3)" if rmse is not None else "no camera path")
-    if "keyframes" in images and "psnr" in images["keyframes"]:
-        lines.append(f"map: {images['keyframes']['psnr']:.1f} dB PSNR on keyframes")
+    if figures["keyframe psnr"] is not None:
+        lines.append(f"map: {figures['keyframe psnr']:.1f} dB PSNR at keyframes")
     if "focal error" in figures["camera"]:
         lines.append(f"focal length: {figures['camera']['focal error']:+.2%} off ({figures['camera']['origin']})")
     if "scaled_l1" in figures["depth"]:

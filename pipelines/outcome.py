@@ -105,6 +105,11 @@ class Outcome:
         source = Path(load_source(self.run).path)
         return source.is_dir() or (source.suffix == "" and not source.exists())
 
+    @property
+    def keyframe_psnr(self) -> float | None:
+        """See `keyframe_psnr`."""
+        return keyframe_psnr(self.records)
+
     def require_map(self) -> GaussianMap:
         """The map. Raises InputError before mapping is done."""
         if self.gaussian_map is None:
@@ -140,6 +145,14 @@ class Outcome:
     def frame_row(self, frame_id: int) -> int:
         """Row of a frame in the trajectory."""
         return int(np.flatnonzero(self.trajectory.frame_ids == frame_id)[0])
+
+
+def keyframe_psnr(records: Mapping[str, StageRecord]) -> float | None:
+    """The PSNR of a run, dB: mean over the keyframes that made the map, each drawn with its exposure at the size that
+    the map was made at, against what it shows of the scene; as the last stage that changed the map measured it. None
+    before mapping is done."""
+    figures = (records[name].figures for name in ("global_ba", "mapping") if name in records)
+    return next((found for f in figures if (found := f.get("keyframe_psnr")) is not None), None)
 
 
 def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:

@@ -89,6 +89,7 @@ def evaluate_outcome(
         "trajectory": trajectory,
         "scale": scale_cells(outcome, trajectory),
         "frame errors": frame_errors(outcome, matched, alignment),
+        "keyframe psnr": outcome.keyframe_psnr,
         **of_map,
         "mesh": mesh_cells(outcome, matched, alignment),
         "cost": cost_cells(outcome),

@@ -70,9 +70,9 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
     evaluation = read_json(run.evaluation_file) if run.evaluation_file.exists() else None
     body = "".join(
         [
-            _heading(outcome, views, loops),
+            _heading(outcome, loops),
             "" if views is None else section("What the map shows", views.sheet, class_legend(outcome, views)),
-            _advice_section(outcome, capture, sparse, loops, views),
+            _advice_section(outcome, capture, sparse, loops),
             _found_section(outcome, sparse, loops),
             _path_section(outcome),
             quality_section(outcome, capture, views),
@@ -88,7 +88,7 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
     return target
 
 
-def _figures(outcome: Outcome, views: RenderedViews | None) -> list[tuple[str, str]]:
+def _figures(outcome: Outcome) -> list[tuple[str, str]]:
     t = outcome.trajectory
     pairs = [("frames posed", f"{int(t.is_posed.sum())} / {len(t.frame_ids)}")]
     if outcome.every is not None:
@@ -98,13 +98,13 @@ def _figures(outcome: Outcome, views: RenderedViews | None) -> list[tuple[str, s
     pairs.append(("keyframes", str(int(t.is_keyframe.sum()))))
     if outcome.gaussian_map is not None:
         pairs.append(("Gaussians", f"{len(outcome.gaussian_map):,}"))
-    if views is not None and views.psnr:
-        pairs.append(("keyframe PSNR, dB", f"{np.mean(views.psnr):.1f}"))
+    if outcome.keyframe_psnr is not None:
+        pairs.append(("keyframe PSNR, dB", f"{outcome.keyframe_psnr:.1f}"))
     return pairs
 
 
-def _heading(outcome: Outcome, views: RenderedViews | None, loops: list[LoopEdge]) -> str:
-    pairs = [*_figures(outcome, views), ("focal length, px", f"{outcome.calibration.intrinsics.fx:.1f}")]
+def _heading(outcome: Outcome, loops: list[LoopEdge]) -> str:
+    pairs = [*_figures(outcome), ("focal length, px", f"{outcome.calibration.intrinsics.fx:.1f}")]
     if pieces := outcome.pieces():
         apart = sum(int(p.trajectory.is_posed.sum()) for p in pieces)
         pairs.append((f"frames in {len(pieces)} further {'piece' if len(pieces) == 1 else 'pieces'}", str(apart)))
@@ -123,10 +123,8 @@ _AFTER = {
 }
 
 
-def _advice_section(
-    outcome: Outcome, capture: Capture, sparse: SparseModel | None, loops: list[LoopEdge], views: RenderedViews | None
-) -> str:
-    lines = advice(outcome, capture, sparse, loops, float(np.mean(views.psnr)) if views and views.psnr else None)
+def _advice_section(outcome: Outcome, capture: Capture, sparse: SparseModel | None, loops: list[LoopEdge]) -> str:
+    lines = advice(outcome, capture, sparse, loops, outcome.keyframe_psnr)
     if not lines:
         return section("What would improve it", "<p>No problem found in this capture.</p>", kind="fine")
     return section("What would improve it", bullets(lines), kind="advice")
@@ -177,7 +175,7 @@ def _piece_section(piece: Outcome, progress: Progress) -> str:
     name = piece.run.root.name
     return section(
         f"Apart from the rest: {name.replace('_', ' ')}",
-        chips([*_figures(piece, views), ("seconds of the source", seconds)]),
+        chips([*_figures(piece), ("seconds of the source", seconds)]),
         "<p>It is not connected to the rest: it has a coordinate system and a unit of its own. "
         f"<code>msgs-slam report {escape(quoted(piece.run.root))}</code> says more; view and render take it, too.</p>",
         '<div class="two">', *trajectory_plots(piece, None), "</div>", "" if views is None else views.sheet,

@@ -171,6 +171,8 @@ def evaluation_rows(result: dict[str, Any]) -> list[Row]:
     rows = [("frames posed", str(frames["posed"]), of), _camera_row(result["camera"])]
     rows += _trajectory_rows(result["trajectory"], stage["poses"])
     rows += _scale_rows(result["scale"])
+    if (psnr := result["keyframe psnr"]) is not None:
+        rows.append(("PSNR at keyframes", f"{psnr:.2f} dB", "as in status and report: at the map's own image size"))
     rows += _image_rows(result["images"], stage["map"])
     rows += _depth_rows(result["depth"]) + _label_rows(result["labels"]) + _mesh_rows(result["mesh"])
     return rows + _cost_rows(result["cost"])
@@ -221,7 +223,7 @@ def _image_rows(cells: dict[str, Any], stage: str) -> list[Row]:
             rows += _missing(f"PSNR, SSIM {kind}", cell)
             continue
         text = f"{_text(cell['psnr'], '.2f')} dB, {cell['ssim']:.4f}"
-        rows.append((f"PSNR, SSIM {kind}", text, f"{cell['views']} views, map of {stage}"))
+        rows.append((f"PSNR, SSIM {kind}", text, f"{cell['views']} views at full size, map of {stage}"))
     lpips = {kind: cell["lpips"] for kind, cell in cells.items() if "lpips" in cell}
     known = [f"{kind} {value:.4f}" for kind, value in lpips.items() if isinstance(value, float)]
     if known:

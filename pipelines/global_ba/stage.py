@@ -243,7 +243,8 @@ def save(
         MAP.save(context.folder, gaussian_map)
     EXPOSURE.save(context.folder, exposure)
     LOOPS.save(context.folder, [loop.edge for loop in found.loops] if closed is not None else [])
-    figures = {
+    kept = refined is not None and refined.is_better
+    figures = ({"keyframe_psnr": round(refined.psnr_after, 5)} if refined is not None and kept else {}) | {
         "candidates": found.tried,
         "verified": len(found.loops) + found.unsupported + found.implausible,
         "implausible": found.implausible,
@@ -251,7 +252,7 @@ def save(
         "loops": len(found.loops) if closed is not None else 0,
         "moved_px": round(moved_px, 3),
         "reprojection_px": None if closed is None else closed.report.figures["reprojection_px"],
-        "joint": "not run" if refined is None else "kept" if refined.is_better else "thrown away",
+        "joint": "not run" if refined is None else "kept" if kept else "thrown away",
         "joint_psnr_before": None if refined is None else round(refined.psnr_before, 3),
         "joint_psnr_after": None if refined is None else round(refined.psnr_after, 3),
     }

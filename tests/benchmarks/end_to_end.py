@@ -13,6 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from msgs_slam.pipelines.outcome import keyframe_psnr
+from msgs_slam.pipelines.run.folder import RunFolder
+
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
@@ -45,13 +48,14 @@ def run_job(name: str, job: Job, work: Path) -> dict[str, Any]:
     """Reconstruct and evaluate; returns one row."""
     run = work / f"{name}.msgs"
     msgs_slam("reconstruct", DATA / job.source, "--out", run, *job.options, "-q")
+    records = RunFolder(run).manifest().records
     stages = json.loads((run / "manifest.json").read_text())["stages"]
     row: dict[str, Any] = {
         "sequence": name,
         "frames": stages["frames"]["figures"]["frames"],
         "posed": stages["tracking"]["figures"]["posed"],
         "focal_px": stages["frames"]["figures"]["focal_px"],
-        "keyframe_psnr_db": stages["mapping"]["figures"]["keyframe_psnr"],
+        "keyframe_psnr_db": keyframe_psnr(records),
         "seconds": round(sum(s["seconds"] for s in stages.values())),
         "peak_mb": round(max(s["peak_memory_mb"] for s in stages.values())),
     }

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,11 +15,13 @@ from cli_runs import OPTIONS, FinishedRun, invoke
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.outcome import keyframe_psnr
 from msgs_slam.pipelines.reconstruct import made_with, reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
 from msgs_slam.pipelines.run.lock import locked
 from msgs_slam.pipelines.source.opening import source_digest
 from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.system.wording import figure_text
 
 
 def interrupt_when(reached: Callable[[], bool], *arguments: object) -> subprocess.CompletedProcess[str]:
@@ -39,6 +42,26 @@ def states(run: Path) -> dict[str, str]:
 
 
 LATER = ("mapping", "global_ba", "export")
+
+
+def test_every_place_gives_one_psnr(finished_run: FinishedRun, copied_run: Callable[[str], Path]) -> None:
+    """Status, report, evaluation and the list of a batch, whatever each of them renders besides."""
+    run = copied_run("run.msgs")
+    records = load_records(RunFolder(run))
+    value = keyframe_psnr(records)
+    assert value is not None
+    assert value > 15
+    assert f"keyframe_psnr {figure_text(value)}" in invoke("status", run).stdout
+    assert invoke("report", run, "-q").exit_code == 0
+    assert f"<b>{value:.1f}</b><span>keyframe PSNR, dB</span>" in (run / "report.html").read_text()
+    assert invoke("evaluate", run, "--truth", finished_run.truth, "-q").exit_code == 0
+    evaluation = json.loads((run / "evaluation" / "evaluation.json").read_text())
+    assert evaluation["keyframe psnr"] == value
+    assert f"| PSNR at keyframes | {value:.2f} dB |" in (run / "evaluation" / "evaluation.md").read_text()
+    assert evaluation["images"]["keyframes"]["psnr"] == pytest.approx(value, abs=0.05), "at the same size"
+    refined = replace(records["global_ba"], figures={**records["global_ba"].figures, "keyframe_psnr": 40.0})
+    assert keyframe_psnr({**records, "global_ba": refined}) == 40, "of the map that the run ended with"
+    assert keyframe_psnr({"frames": records["frames"]}) is None
 
 
 def test_changed_setting_then_ctrl_c(finished_run: FinishedRun, copied_run: Callable[[str], Path]) -> None:
