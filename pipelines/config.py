@@ -141,14 +141,14 @@ class FramesConfig:
         0.025,
         "a new keyframe when points have moved by this fraction of the image width",
         within=(0.001, 0.5),
-        draft=0.045,
+        draft=0.05,
     )
     features: str = setting("sift", "sift; aliked, with LightGlue, needs networks of 49 MB", ("sift", "aliked"))
     max_features: int = setting(
         3000, "features of a keyframe, at most about this many", within=(50, 100_000), draft=2000
     )
     overlap: int = setting(
-        8, "each keyframe is matched with this many after it (and a few further ones)", within=(1, 1000)
+        8, "each keyframe is matched with this many after it (and a few further ones)", within=(1, 1000), draft=6
     )
     loop_candidates: int = setting(
         4, "each keyframe is also matched with this many that look alike, for loops", within=(0, 1000)
@@ -293,7 +293,7 @@ class GlobalBaConfig:
             "pose-frames",
             help="Give a pose to every image of a video, those between the picked frames too, or to the picked ones "
             "(frames.rate a second) alone. Default: every.",
-        ),
+        ), draft="picked",
     )  # fmt: skip
 
 

@@ -114,6 +114,8 @@ class StageReporter:
         if name == STAGES[0] and state in (ENDED, UP_TO_DATE):  # what there is to do is known from here on
             self._left.work = work_of(self._config, (record or self._records[name]).figures)
             of_work = self._left.work.text
+        if state == (ENDED if name == STAGES[0] else BEGUN) and name != self._names[-1]:
+            self._left.measure()
         left = self._left.left
         self._progress.stage(StageEvent(name, index, len(self._names), state, seconds, figures, left, of_work))
 

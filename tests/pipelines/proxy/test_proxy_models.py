@@ -13,8 +13,12 @@ import pytest
 
 from msgs_slam.formats.errors import DiskFullError, InputError
 from msgs_slam.formats.reading import file_sha256
+from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.networks.download import fetch
 from msgs_slam.pipelines.networks.registry import Model, ModelStore
+from msgs_slam.pipelines.proxy.inputs import left_to_auto
+from msgs_slam.pipelines.proxy.selection import choose_depth
+from msgs_slam.pipelines.read_config import load_config
 
 DATA = np.random.default_rng(0).bytes(700_000)
 SHA = hashlib.sha256(DATA).hexdigest()
@@ -234,13 +238,20 @@ def test_a_file_of_unknown_size_is_continued_too(server: tuple[str, Behaviour], 
     assert [r for _, r in behaviour.requests] == ["", "bytes=300000-"]
 
 
-def test_the_small_depth_network_comes_before_the_large_one(tmp_path: Path) -> None:
+def test_the_small_depth_network_comes_before_the_large_one_but_for_best(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MSGS_SLAM_CACHE", str(tmp_path))
+    assert choose_depth(ProxyConfig(depth="best")).kind == "multiview"
     models = ModelStore.open(tmp_path)
     large, small = models.get("metric3d-large"), models.get("metric3d-small")
     for model in (large, small):
         with models.path(model).open("wb") as file:
             file.truncate(model.bytes)  # a sparse file
         assert models.first_here("depth") == model
+    names = [choose_depth(load_config(quality=q).proxy).card for q in ("normal", "best")]
+    assert [card.name for card in names if card is not None] == ["onnx:metric3d-small", "onnx:metric3d-large"]
+    assert left_to_auto(load_config(quality="best")) == ("depth", "labels")
 
 
 def test_a_model_that_needs_another_is_here_when_both_are(server: tuple[str, Behaviour], tmp_path: Path) -> None:

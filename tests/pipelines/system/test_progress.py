@@ -8,7 +8,7 @@ import pytest
 
 from msgs_slam.msgs_cli.progress import BarProgress
 from msgs_slam.pipelines.config import Config, RunConfig
-from msgs_slam.pipelines.engine.time_left import USUAL, TimeLeft, work_of
+from msgs_slam.pipelines.engine.time_left import USUAL, TimeLeft, Work, machine_speed, work_of
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.system.progress import (
     BEGUN,
@@ -62,6 +62,21 @@ def test_work_grows_with_what_there_is_to_do() -> None:
     assert work_of(one, {"keyframes": 46}) == USUAL, "a run of an earlier version"
     said = StageEvent("frames", 1, 6, ENDED, 60.0, {}, lambda: 360.0, usual.text)
     assert said.left_text == "; about 6 min left on this machine: 46 keyframes at 640 px"
+
+
+def test_the_machine_is_measured_once_and_what_it_does_then_counts_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    speeds = iter([2.0])
+    monkeypatch.setattr("msgs_slam.pipelines.engine.time_left.machine_speed", lambda: next(speeds))
+    left = TimeLeft(
+        {"frames": 500.0}, ("frames", "proxy", "mapping"), Work({"frames": 50, "proxy": 80, "mapping": 120})
+    )
+    for _ in range(2):
+        left.measure()
+    left.begin("proxy")
+    assert left.left() == pytest.approx(400, abs=1), "hard images do not make the rest slow"
+    left.end("proxy", 240.0)
+    assert left.left() == pytest.approx(120 * (240 + 2 * 40) / (80 + 40)), "slower than measured"
+    assert 0 < machine_speed() < 1000
 
 
 def test_words_for_a_time() -> None:
