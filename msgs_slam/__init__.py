@@ -114,7 +114,7 @@ def reconstruct(
     for bars on a terminal and a line a stage elsewhere, or an object with `track` and `stage`
     (`msgs_slam.pipelines.system.progress.Progress`). Raises InputError for a source or setting that cannot be used.
     """
-    from .pipelines.read_config import load_config, merge_settings
+    from .pipelines.read_config import load_config, merge_with_quality
     from .pipelines.reconstruct import default_run_folder, existing_config
     from .pipelines.reconstruct import reconstruct as run_reconstruct
     from .pipelines.run.folder import RunFolder
@@ -122,7 +122,7 @@ def reconstruct(
     source = Path(source)
     run = RunFolder(Path(out)) if out is not None else default_run_folder(source)
     if isinstance(settings, Mapping):
-        config = merge_settings(existing_config(run) or load_config(), _nested(settings), "settings")
+        config = merge_with_quality(existing_config(run) or load_config(), _nested(settings), "settings")
     else:
         config = load_config(None, settings, base=existing_config(run))
     run_reconstruct(source, run, config, _progress(progress))

@@ -39,7 +39,7 @@ def load_config(
     asked += [(quality, "--quality")] if quality is not None else []
     of_file = run.get("quality") if isinstance(run := values.get("run"), Mapping) else None
     if of_file is not None:
-        config = merge_settings(with_quality(config, of_file, str(file)), values, str(file))
+        config = merge_with_quality(config, values, str(file))
     for wanted, source in asked:
         config = with_quality(config, wanted, source)
     if of_file is None:
@@ -56,6 +56,14 @@ def _override(text: str) -> tuple[dict[str, dict[str, Any]], str]:
     if not separator or not dot:
         raise SettingError(f"--set {text}: expected section.key=value, for example --set frames.rate=5")
     return {section: {name: _parse_value(value.strip())}}, f"--set {text}"
+
+
+def merge_with_quality(config: Config, changes: Mapping[str, Any], source: str) -> Config:
+    """Merge as `merge_settings`, after the values of a run.quality that is among the changes."""
+    of_run = changes.get("run")
+    if isinstance(of_run, Mapping) and "quality" in of_run:
+        config = with_quality(config, of_run["quality"], source)
+    return merge_settings(config, changes, source)
 
 
 def with_quality(config: Config, quality: Any, source: str) -> Config:
@@ -174,7 +182,8 @@ def toml_value(value: bool | int | float | str) -> str:
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f") if isinstance(value, str) else repr(value)
 
 
-_SAME_AS = {"gpu": "cuda", "nvidia": "cuda", "cuda:0": "cuda", "video": "images", "mp4": "images"}
+_SAME_AS = {"gpu": "cuda", "nvidia": "cuda", "cuda:0": "cuda", "video": "images", "mp4": "images",
+            "high": "best", "fast": "draft", "low": "draft", "preview": "draft"}  # fmt: skip
 """What people type for a choice that has another name."""
 
 

@@ -16,6 +16,7 @@ from msgs_slam.pipelines.read_config import (
     config_to_toml,
     load_config,
     merge_settings,
+    merge_with_quality,
     with_absolute_paths,
 )
 
@@ -159,6 +160,8 @@ def test_a_quality_is_a_set_of_values_that_what_is_given_besides_wins_over(tmp_p
         assert load_config(overrides=words).mapping == dataclasses.replace(draft.mapping, passes=9.0)
     given = chosen_config(None, ["frames.max_side=960"], {"run__quality": "draft", "proxy__depth": "multiview"})
     assert (given.frames.max_side, given.proxy.stereo_side) == (960, draft.proxy.stereo_side)
+    both = {"run": {"quality": "draft"}, "mapping": {"passes": 9}}
+    assert merge_with_quality(normal, both, "").mapping == dataclasses.replace(draft.mapping, passes=9.0)
     file = tmp_path / "settings.toml"
     file.write_text('[mapping]\npasses = 9\n[run]\nquality = "draft"\n')
     assert load_config(file).mapping.passes == 9
@@ -180,3 +183,5 @@ def test_a_run_remembers_its_quality_and_changes_it(tmp_path: Path) -> None:
     assert load_config(base=best, quality="normal") == load_config(overrides=["frames.parallax=0.06"])
     with pytest.raises(InputError, match=r"--quality is one of draft, normal, best; got 'high'"):
         load_config(quality="high")
+    with pytest.raises(InputError, match="did you mean best"):
+        load_config(overrides=["run.quality=high"])
