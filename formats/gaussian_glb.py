@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .errors import InputError
 from .gaussians import GaussianCloud, unit_quaternions
-from .glb import FLOAT, WIDTHS, Part, glb_parts, write_glb, write_primitive
+from .glb import FLOAT, UNLIT, WIDTHS, Part, glb_parts, linear, material, write_glb, write_primitive
 from .ply import SH_C0
 from .reading import parsing, read_bytes
 from .spz import read_spz_stream, spz_bytes
@@ -32,17 +32,16 @@ _MIN_OPACITY = 1e-4
 def write_gaussian_glb(path: Path, cloud: GaussianCloud, class_names: tuple[str, ...] = ()) -> None:
     """Write a cloud, its class numbers as attribute _LABEL and their names in the mesh's extras.
 
-    The cloud has x right, y down, z forward, as from a splat PLY; the file's y is up. Nothing is rounded but the
-    fallback's colours. The same cloud gives the same bytes. Raises ValueError for an empty cloud, which glTF cannot
-    hold, InputError when the disk refuses.
+    The cloud has x right, y down, z forward, as from a splat PLY; the file's y is up. Nothing is rounded. The same
+    cloud gives the same bytes. Raises ValueError for an empty cloud, which glTF cannot hold, InputError when the disk
+    refuses.
     """
     if len(cloud) == 0:
         raise ValueError("write_gaussian_glb: glTF has no way to store an empty cloud")
     opacity = (1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))).astype(np.float32)
-    rgba = np.column_stack([np.clip(cloud.colors, 0, 1), opacity])
     arrays: dict[str, NDArray[Any]] = {
         "POSITION": cloud.means * _FLIP,
-        "COLOR_0": np.round(rgba * 255).astype(np.uint8),
+        "COLOR_0": np.column_stack([linear(cloud.colors), opacity]),
         f"{EXTENSION}:ROTATION": cloud.quat_wxyz[:, [1, 2, 3, 0]] * np.append(_FLIP, np.float32(1)),
         f"{EXTENSION}:SCALE": np.exp(cloud.log_scales),
         f"{EXTENSION}:OPACITY": opacity,
@@ -50,11 +49,9 @@ def write_gaussian_glb(path: Path, cloud: GaussianCloud, class_names: tuple[str,
     }
     if cloud.class_ids is not None:
         arrays[_LABEL] = cloud.class_ids.astype(np.float32)
-    parts = [
-        Part.of(name, array, **({"normalized": True} if name == "COLOR_0" else {})) for name, array in arrays.items()
-    ]
-    primitive = {"mode": 0, "extensions": {EXTENSION: _PROPERTIES}}
-    write_primitive(path, parts, primitive, class_names, {}, extensions=[EXTENSION])
+    parts = [Part.of(name, array) for name, array in arrays.items()]
+    primitive = {"mode": 0, "material": 0, "extensions": {EXTENSION: _PROPERTIES}}
+    write_primitive(path, parts, primitive, class_names, {}, {"materials": [material()]}, [EXTENSION, UNLIT])
 
 
 def write_compressed_glb(path: Path, cloud: GaussianCloud) -> None:

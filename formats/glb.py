@@ -22,6 +22,19 @@ _KINDS = {width: kind for kind, width in WIDTHS.items()}
 _COMPONENTS = {"|u1": 5121, "<u4": 5125, "<f4": FLOAT}
 _VERTICES, _INDICES = 34962, 34963
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
+UNLIT = "KHR_materials_unlit"
+
+
+def material(unlit: bool = True, **more: Any) -> dict[str, Any]:
+    """Describe a surface seen from both sides that does not shine; `unlit`: its colours hold the light already."""
+    shown = {"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1, **more}, "doubleSided": True}
+    return {**shown, "extensions": {UNLIT: {}}} if unlit else shown
+
+
+def linear(colors: NDArray[Any]) -> NDArray[np.float32]:
+    """Convert sRGB colours in 0..1 to linear light, as glTF wants COLOR_0 (2.0, 3.9.2); beyond 0..1 they are cut."""
+    srgb = np.clip(colors, 0, 1).astype(np.float32)
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from .atomic import write_text
 from .errors import InputError
-from .glb import Part, write_primitive
+from .glb import UNLIT, Part, linear, material, write_primitive
 from .images import jpeg_bytes, write_rgb
 from .ply import Rows, columns, read_ply, read_rows, write_ply
 from .reading import parsing
 from .trajectory import FARTHEST
 
-_UNLIT = "KHR_materials_unlit"
 _LINEAR, _MIPMAPPED, _CLAMPED = 9729, 9987, 33071
 
 _LABEL_ATTRIBUTE = "_LABEL"
@@ -130,7 +129,7 @@ def read_mesh_ply(path: Path) -> MeshArrays:
 def write_mesh_glb(
     path: Path, mesh: MeshBlocks, class_names: tuple[str, ...] = (), gltf_from_world: NDArray[np.float64] | None = None
 ) -> None:
-    """Write a GLB with vertex colours, the labels as vertex attribute _LABEL, class names in the mesh's extras.
+    """Write an unlit GLB with vertex colours, the labels as vertex attribute _LABEL, class names in the mesh's extras.
 
     gltf_from_world (3, 3) turns the vertices: glTF wants y up. Errors as `write_mesh_ply`, ValueError for no faces.
     """
@@ -143,15 +142,16 @@ def write_mesh_glb(
 
     ends = np.array([(points.min(0), points.max(0)) for points in positions()])
     box = {"min": ends[:, 0].min(0).tolist(), "max": ends[:, 1].max(0).tolist()}
-    colors = (np.insert(colors, 3, 255, axis=1) for _, colors, _ in mesh.vertices())
+    colors = (linear(colors / 255) for _, colors, _ in mesh.vertices())
     parts = [
         Part("POSITION", mesh.vertex_count, 3, "<f4", positions(), box),
-        Part("COLOR_0", mesh.vertex_count, 4, "|u1", colors, {"normalized": True}),
+        Part("COLOR_0", mesh.vertex_count, 3, "<f4", colors),
         # glTF wants every vertex at a multiple of 4 bytes: a float per label instead of a byte
         Part(_LABEL_ATTRIBUTE, mesh.vertex_count, 1, "<f4", (labels for _, _, labels in mesh.vertices())),
         Part("", 3 * mesh.face_count, 1, "<u4", mesh.faces()),
     ]
-    write_primitive(path, parts, {"mode": 4}, class_names, {"name": "mesh"})
+    primitive, extras = {"mode": 4, "material": 0}, {"materials": [material()]}
+    write_primitive(path, parts, primitive, class_names, {"name": "mesh"}, extras, [UNLIT])
 
 
 def _triangles(polygons: NDArray, vertices: int) -> NDArray[np.int32]:
@@ -230,12 +230,11 @@ def write_textured_glb(path: Path, mesh: TexturedMesh, class_names: tuple[str, .
         Part.of("_LABEL", mesh.labels[mesh.corner_vertex].astype(np.float32)),
         Part.of("", mesh.faces.reshape(-1).astype(np.uint32)),
     ]
-    shown = {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": 1}
     extras = {
-        "materials": [{"pbrMetallicRoughness": shown, "extensions": {_UNLIT: {}}}],
+        "materials": [material(baseColorTexture={"index": 0})],
         "textures": [{"source": 0, "sampler": 0}],
         "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPPED, "wrapS": _CLAMPED, "wrapT": _CLAMPED}],
         "images": [{"bufferView": len(parts), "mimeType": "image/jpeg"}],
     }
     picture = jpeg_bytes(mesh.texture)
-    write_primitive(path, parts, {"material": 0}, class_names, {"name": "mesh"}, extras, [_UNLIT], picture)
+    write_primitive(path, parts, {"material": 0}, class_names, {"name": "mesh"}, extras, [UNLIT], picture)

@@ -97,7 +97,7 @@ class SettingRefused(click.ClickException):
 
 _COMES_WITH = {"nerfstudio": "colmap"}
 """Of `export --only`: written together with another kind."""
-_MEANT = {"obj": "texture", "gltf": "glb", "usdz": "usd", "gaussians": "ply", "splat": "ply", "point_cloud": "ply",
+_MEANT = {"texture": "mesh", "gltf": "glb", "usdz": "usd", "gaussians": "ply", "splat": "ply", "point_cloud": "ply",
           "pointcloud": "ply", "poses": "tum", "trajectory": "tum", "transforms": "nerfstudio", "3dtiles": "tiles",
           "web": "html", "page": "html", "map": "html", "svg": "floorplan", "plan": "floorplan"}  # fmt: skip
 """What people call a kind of file → its name."""
@@ -229,7 +229,7 @@ def resume(
 @RUN_ARGUMENT
 @click.option(
     "--only", type=KindOfFile([*EXPORTS, *_COMES_WITH]),
-    help="Write one kind of file only; nerfstudio's comes with colmap, an OBJ with texture. Default: all.",
+    help="Write one kind of file only; nerfstudio's comes with colmap. Default: all.",
 )  # fmt: skip
 @click.option("--to", type=FOLDER, metavar="DIR", help="Where to write. Default: RUN/export.")
 @settings_options
@@ -242,10 +242,10 @@ def export(
     overrides: tuple[str, ...],
     output: Output,
 ) -> None:
-    """Write the files for other programs: COLMAP model, Gaussian PLY, SPZ, SOG or GLB, labelled mesh, the same with
-    a texture, TUM trajectory; `--only html`: one web page that shows the map, to send to somebody; `--only tiles`: 3D
-    Tiles for CesiumJS; `--only collision`: a light mesh to walk in; `--only usd`: the mesh as USDZ; `--only floorplan`:
-    the walls from above with their lengths.
+    """Write the files for other programs: COLMAP model, Gaussian PLY, SPZ, SOG or GLB, labelled mesh, textured mesh,
+    TUM trajectory; `--only html`: one web page that shows the map, to send to somebody; `--only tiles`: 3D Tiles for
+    CesiumJS; `--only obj`: the textured mesh as OBJ; `--only collision`: a light mesh to walk in; `--only usd`: the
+    mesh as USDZ; `--only floorplan`: the walls from above with their lengths.
 
     Other settings than the run's own (--set export.voxel=0.02, --set export.spz=true) need --to; `msgs-slam resume RUN
     --set ...` changes them in the run itself.

@@ -103,3 +103,5 @@ def print_summary(root: Path, records: dict[str, Any]) -> None:
         say(f"\n{line}")
     if "export" in records:
         say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
+        if (page := root / "export" / "map.html").exists():
+            say(f"Open in a browser: {page}")

@@ -5,7 +5,7 @@ from typing import Any
 
 STAGES = ("frames", "proxy", "tracking", "mapping", "global_ba", "export")
 EXPORTS = (
-    "colmap", "ply", "spz", "sog", "glb", "tiles", "html", "mesh", "texture", "collision", "usd", "floorplan", "tum",
+    "colmap", "ply", "spz", "sog", "glb", "tiles", "html", "mesh", "obj", "collision", "usd", "floorplan", "tum",
 )  # fmt: skip
 EXTENSION = "extension_"
 """Begins the folder of a run in which what it was before it was extended is kept."""
@@ -65,7 +65,7 @@ class RunConfig:
         option=Option(
             "quality",
             help="draft: a third of the time or less, fewer keyframes and smaller images; best: larger images, more "
-            "passes, the largest networks that are installed, a textured mesh. Options and settings that are given "
+            "passes, the largest networks that are installed. Options and settings that are given "
             "besides win. Default: normal.",
         ),
     )  # fmt: skip
@@ -343,7 +343,9 @@ class ExportConfig:
     spz_version: int = setting(4, "version of that file; 3 for older readers", within=(3, 4))
     splat_glb: bool = setting(False, "write the map as point_cloud.glb too (glTF, KHR_gaussian_splatting)")
     sh_rest: bool = setting(False, "the splat PLYs hold f_rest_0 to 44 too, all zero, for readers that insist on them")
-    texture: bool = setting(False, "write a lighter mesh with a texture of photographs too: mesh_textured.*", best=True)
+    texture: bool = setting(
+        True, "mesh.glb has a texture of the keyframes; false: all vertices, with their colours", draft=False
+    )
 
 
 @dataclass(frozen=True)

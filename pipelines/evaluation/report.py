@@ -15,6 +15,7 @@ from ...formats.datasets.sequence import distortion_names
 from ...formats.reading import read_bytes
 from ...formats.textfile import read_json
 from ..config import Config, config_to_dict
+from ..export.extra.web_page import WEB_PAGE
 from ..export.readme import lengths, readme
 from ..export.stage import on_earth
 from ..export.writers import IMAGES
@@ -225,7 +226,10 @@ def _export_section(outcome: Outcome) -> str:
         return section("Files for other programs", "<p>Not exported yet.</p>")
     files = [row for row in files_of_export(outcome.run) if Path(row[0]).parts[0] != IMAGES]
     notes = readme(outcome.run.find(WORLD) or FIRST, outcome.metres, outcome.metric)
-    return section("Files for other programs", f"<pre>{escape(notes)}</pre>", table(("in export/", "size"), files))
+    page = outcome.run.stage("export") / WEB_PAGE
+    link = f'<p><a href="export/{WEB_PAGE}">The map in one page</a>, to look at and to send.</p>'
+    notes = f"{link if page.exists() else ''}<pre>{escape(notes)}</pre>"
+    return section("Files for other programs", notes, table(("in export/", "size"), files))
 
 
 def files_of_export(run: RunFolder) -> list[tuple[str, str]]:

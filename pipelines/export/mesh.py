@@ -10,7 +10,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.mesh import MeshBlocks, mesh_blocks, read_mesh_ply, write_mesh_glb, write_mesh_ply
+from ...formats.mesh import (
+    MeshBlocks,
+    mesh_blocks,
+    read_mesh_ply,
+    write_mesh_glb,
+    write_mesh_ply,
+    write_textured_glb,
+    write_textured_obj,
+)  # fmt: skip
 from ..compute.threads import get_threads, host_threads
 from ..config import ExportConfig
 from ..engine.stages import StageContext
@@ -24,7 +32,7 @@ from ..system.parallel import LruSequence, abreast
 from ..system.progress import Progress
 from ..system.values import load_value, save_value
 from ..types import VOID
-from .extra.texture import make_textured, write_textured
+from .extra.texture import make_textured
 from .planes import Planes, planes_of, snap_to_planes
 from .surface import Region, chunk_surfaces, joined, weld
 from .volume import Grid, fuse, make_grid
@@ -38,12 +46,15 @@ LONG = 200
 SURE = 0.5
 """Confidence of a proxy's depth from which the depth drawn there stays where it is."""
 _KEPT_BYTES = 100e6
+MOST_TEXTURED = 4_000_000
+"""Triangles of a mesh that is wrapped in a texture: an image of 4096 pixels a side shows a larger one no better than
+the colours of its vertices do."""
 
 
 @dataclass(frozen=True)
 class MeshJob:
-    """Which `kinds` of the mesh ("mesh", "texture") go into a folder; a mesh.ply and mesh.glb that are there to `keep`
-    stay. The tasks are those of `context`, whose snapshot has what does not fit into memory."""
+    """Which `kinds` of the mesh ("mesh": PLY and GLB, "obj") go into a folder; a mesh.ply and mesh.glb that are there
+    to `keep` stay. The tasks are those of `context`, whose snapshot has what does not fit into memory."""
 
     context: StageContext
     kinds: tuple[str, ...]
@@ -57,23 +68,24 @@ class MeshJob:
 
     @property
     def ply(self) -> Path:
-        """Path of the mesh, which a texture needs too."""
+        """Path of the mesh, which the other files are made from."""
         return (self.folder if "mesh" in self.kinds else self.scratch) / "mesh.ply"
 
 
 def write_meshes(job: MeshJob, outcome: Outcome, world: World) -> list[Path]:
     """Draw the map in the keyframes, snap uncertain depths to planes, fuse all region by region, join the regions, and
-    write what the job asks for, with a texture or without.
+    write what the job asks for: the mesh with all its vertices as a PLY; a lighter one with a texture as a GLB or OBJ.
 
     `outcome` has been moved, and may be without its map. Returns the paths written.
     """
     settings, names, axes = job.context.config.export, outcome.classes.names, world.gltf_from_exported
-    glb, count = job.folder / "mesh.glb", len(keyframe_rows(outcome))
+    glb, obj, count = job.folder / "mesh.glb", job.folder / "mesh.obj", len(keyframe_rows(outcome))
     views, is_made = drawn_views(job.scratch, count), job.keep and job.ply.exists()
-    if not is_made or "texture" in job.kinds:
-        in_chunks(job.context, draw_keyframes, count, move=outcome.move)
-        if settings.planes:
-            in_chunks(job.context, snap_views, count, planes=planes_in(job.scratch, count))
+    if is_made and glb.exists():
+        return [job.ply, glb]
+    in_chunks(job.context, draw_keyframes, count, move=outcome.move)
+    if settings.planes:
+        in_chunks(job.context, snap_views, count, planes=planes_in(job.scratch, count))
     if not is_made:
         grid = _grid_around(views, settings)
         regions, class_ids = len(list(grid.regions())), tuple(outcome.label_of_channel.tolist())
@@ -81,14 +93,18 @@ def write_meshes(job: MeshJob, outcome: Outcome, world: World) -> list[Path]:
         # Regions are loaded one at a time, whenever `joined` goes over them.
         whole = joined(lambda: (load_value(_region_file(job.scratch, n)) for n in range(regions)))
         write_mesh_ply(job.ply, whole, names)
-    mesh = mesh_blocks(job.ply)
-    if "mesh" in job.kinds and mesh.face_count and not (job.keep and glb.exists()):
+    mesh, paths = mesh_blocks(job.ply), [job.ply] if "mesh" in job.kinds else []
+    if not mesh.face_count:
+        return paths
+    if "obj" not in job.kinds and (mesh.face_count > MOST_TEXTURED or not settings.texture):
         write_mesh_glb(glb, mesh, names, axes)
-    paths = [job.ply, glb][: 1 + (mesh.face_count > 0)] if "mesh" in job.kinds else []
-    if "texture" in job.kinds and mesh.face_count:
-        texture = make_textured(outcome, read_mesh_ply(job.ply), Shown(views), job.context.progress)
-        paths += write_textured(texture, names, job.folder, axes)
-    return paths
+        return [*paths, glb]
+    textured = make_textured(outcome, read_mesh_ply(job.ply), Shown(views), job.context.progress)
+    if "mesh" in job.kinds:
+        turned = replace(textured, vertices=(textured.vertices @ axes.T).astype(np.float32))
+        write_textured_glb(glb, turned, names)
+        paths.append(glb)
+    return paths + (write_textured_obj(obj, textured, names) if "obj" in job.kinds else [])
 
 
 def _scratch(context: StageContext) -> Path:

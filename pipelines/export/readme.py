@@ -39,6 +39,10 @@ class Entry:
 _SET, _ONLY = "--set export.{}=true", "msgs-slam export RUN --only {}"
 _ENTRIES = (
     Entry(
+        "map.html", "the map to look at in any browser, without a server or a network, on a computer or a phone.",
+        "html",
+    ),
+    Entry(
         "images/, sparse/0/",
         "a COLMAP data set: the undistorted frames whose place is known, and their camera, poses and points (binary, "
         "text, and points3D.ply). Pinhole, no distortion left. A frame of which only the rotation is known is in "
@@ -85,20 +89,17 @@ _ENTRIES = (
         "glb", f"{_SET.format('splat_glb')}, or {_ONLY.format('glb')}",
     ),
     Entry(
-        "map.html", "the map to look at in any browser, without a server or a network, on a computer or a phone.",
-        "html", _ONLY.format("html"),
+        "mesh.ply",
+        "the surface with all its vertices, a colour and a label (property label) at each. MeshLab, trimesh.", "mesh",
     ),
     Entry(
-        "mesh.ply, mesh.glb",
-        "the surface with a colour and a label (PLY: property label, GLB: attribute _LABEL) at each vertex. MeshLab, "
-        "Blender, trimesh.",
+        "mesh.glb",
+        "a tenth of those vertices (labels: attribute _LABEL), and a texture made from the keyframes, exposure "
+        "removed; shown as it is, without lights. Blender, game engines, the web.",
         "mesh",
     ),
     Entry(
-        "mesh_textured.obj, .mtl, .png, .glb",
-        "a tenth of the mesh's vertices, and its surface as an image made from the keyframes' photographs, exposure "
-        "removed. OBJ: a group for each class.",
-        "texture", f"{_SET.format('texture')}, or {_ONLY.format('texture')}",
+        "mesh.obj, .mtl, .png", "the mesh with the texture as OBJ, a group for each class.", "obj", _ONLY.format("obj"),
     ),
     Entry(
         "collision.glb",

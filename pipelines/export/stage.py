@@ -58,18 +58,13 @@ def run(context: StageContext) -> dict[str, Any]:
     # The mesh, by tasks that load the map themselves
     outcome = replace(outcome, gaussian_map=None)
     release_free_memory()
-    write_meshes(MeshJob(context, mesh_kinds(settings), folder, keep=True), outcome, world)
+    write_meshes(MeshJob(context, ("mesh",), folder, keep=True), outcome, world)
     mesh = mesh_blocks(folder / "mesh.ply")
     if mesh.face_count == 0:
         context.warn("the mesh is empty: no surface is seen by enough keyframes")
 
     counts = {"images": int(outcome.trajectory.is_placed.sum()), "gaussians": gaussians}
     return {**counts, **mesh_figures(mesh), **world_figures(world), **metres_figures(metres)}
-
-
-def mesh_kinds(settings: ExportConfig) -> tuple[str, ...]:
-    """List what `write_meshes` is to write when nothing in particular is asked for."""
-    return ("mesh", "texture") if settings.texture else ("mesh",)
 
 
 def guess_metres(context: StageContext, outcome: Outcome, settings: ExportConfig) -> Metres | None:
@@ -135,9 +130,10 @@ def _check(source: Path, config: Config) -> None:
 
 
 def write_all_but_mesh(outcome: Outcome, world: World, settings: ExportConfig, folder: Path) -> list[Path]:
-    """COLMAP model, PLYs, trajectory, notes; SPZ and GLB where the settings want them, tiles of a map that was made in
-    parts. `outcome` stands in `world`."""
-    paths = write_colmap(outcome, folder) + write_ply(outcome, settings.sh_rest, folder)
+    """Web page, COLMAP model, PLYs, trajectory, notes; SPZ and GLB where the settings want them, tiles of a map that
+    was made in parts. `outcome` stands in `world`."""
+    paths = write_web_page(outcome, world, folder) + write_colmap(outcome, folder)
+    paths += write_ply(outcome, settings.sh_rest, folder)
     paths += write_splats("spz", outcome, world, settings, folder) if settings.spz else []
     paths += write_splats("glb", outcome, world, settings, folder) if settings.splat_glb else []
     paths += write_tiles(outcome, world, folder) if outcome.run.load(SUBMAPS) else []
@@ -179,7 +175,7 @@ def export_run(
         "tiles": lambda: write_tiles(outcome, world, folder),
         "html": lambda: write_web_page(outcome, world, folder),
         "mesh": lambda: mesh("mesh"),
-        "texture": lambda: mesh("texture"),
+        "obj": lambda: mesh("obj"),
         "collision": lambda: write_collision(found, world, folder),
         "usd": lambda: write_usd(found, world, folder),
         "floorplan": lambda: write_floor_plan(found, folder),
@@ -190,7 +186,7 @@ def export_run(
         # The run's own folder has a README that tells of every kind.
         own = folder.resolve() == run.stage("export").resolve()
         return paths if own else [*paths, write_readme(outcome, world, folder, only)]
-    return write_all_but_mesh(outcome, world, settings, folder) + mesh(*mesh_kinds(settings))
+    return write_all_but_mesh(outcome, world, settings, folder) + mesh("mesh")
 
 
 def _kept_world(outcome: Outcome, settings: ExportConfig) -> World | None:

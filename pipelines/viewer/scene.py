@@ -57,11 +57,12 @@ class ViewerCamera:
 
 @dataclass(frozen=True)
 class ViewerScene:
-    """cloud: the M Gaussians in the world of the exported files; labels (M,) uint8 indices into `class_names`, VOID for
-    none, or None without classes; `scale` multiplies the world's lengths for show; up (3,); path (N, 3) camera centres
-    as shown; mesh_file of the run, if there is one; world: which one, as camera paths name it; whether the floor is at
-    0; is_metric, metres: what a unit of the world is; what: the cloud's elements, GAUSSIANS or, before there is a map,
-    POINTS; is_empty: nothing is there yet, and the cloud holds an invisible one."""
+    """cloud: the M Gaussians in the world of the exported files; labels (M,) uint8 indices into `class_names`, VOID
+    for none, or None without classes; `scale` multiplies the world's lengths for show; up (3,); path (N, 3) camera
+    centres as shown; mesh_file of the run, a GLB, if there is one, and what turns it into the world (3, 3); world:
+    which one, as camera paths name it; whether the floor is at 0; is_metric, metres: what a unit of the world is;
+    what: the cloud's elements, GAUSSIANS or, before there is a map, POINTS; is_empty: nothing is there yet, and the
+    cloud holds an invisible one."""
 
     title: str
     cloud: GaussianCloud
@@ -73,6 +74,7 @@ class ViewerScene:
     cameras: list[ViewerCamera] = field(default_factory=list)
     path: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
     mesh_file: Path | None = None
+    world_from_mesh: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
     run: RunFolder | None = None
     world: str = EXPORTED
     has_floor: bool = False
@@ -162,7 +164,8 @@ def _from_run(outcome: Outcome) -> ViewerScene:
         class_colors=outcome.classes.colors,
         cameras=[ViewerCamera.of(outcome.frames[row], world_from_cam[row], k) for row in rows],
         path=centers * scale,
-        mesh_file=outcome.run.file("export", MESH) if outcome.run.has("export", MESH) else None,
+        mesh_file=mesh if (mesh := (run.stage("export") / MESH).with_suffix(".glb")).is_file() else None,
+        world_from_mesh=np.eye(3) if world is None else world.gltf_from_exported.T,
         run=outcome.run,
         world=RUN if world is None else EXPORTED,
         has_floor=world is not None and world.has_floor,

@@ -10,17 +10,16 @@ from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ...formats.errors import InputError, install_command
-from ...formats.mesh import read_mesh_ply
 from ..export.extra.floor_plan import walls_of_run
 from ..source.sharpness import at_most_wide
 from .door import guarding
 from .flight import Flight
 from .live import Watch
-from .scene import MODES, ViewerCamera, ViewerScene, client_view, load_scenes, move_client, shown_pose
+from .scene import MODES, POINTS, ViewerCamera, ViewerScene, client_view, load_scenes, move_client, shown_pose
 from .tools import Selection, Tape, class_name, length_text, unit_text
 
 _FRUSTUM = 0.09
@@ -90,6 +89,7 @@ class Viewer:
         self.show(MODES[0])
         self._cameras = [self._add_camera(i, camera) for i, camera in enumerate(scene.cameras)]
         self._path = self._add_path()
+        self._show_cameras(scene.what == POINTS)  # in front of a map they hide it
         self._mesh = self._add_mesh()
 
     @_alone
@@ -100,7 +100,7 @@ class Viewer:
         self._add_tools()
         self.mode.value = MODES[0]
         for name, box in self.boxes.items():
-            box.value = name not in ("Mesh", "Floor plan")
+            box.value = name.startswith("Show") or (name == "Cameras" and self.scene.what == POINTS)
         for client in self.server.get_clients().values():
             self._place(client)
 
@@ -201,7 +201,7 @@ class Viewer:
         gui.add_button("From above", color=_GREY).on_click(lambda event: self._look_down(event.client))
         self._checkbox(f"Show {self.scene.what}", True, self._show_splats)
         if self._cameras:
-            self._checkbox("Cameras", True, self._show_cameras)
+            self._checkbox("Cameras", self.scene.what == POINTS, self._show_cameras)
         if any(scene.mesh_file for scene in self.scenes):
             self._checkbox("Mesh", False, self._show_mesh)
             self._checkbox("Floor plan", False, self._show_floor_plan)
@@ -297,13 +297,10 @@ class Viewer:
 
     @_alone
     def _place(self, client: Any) -> None:
-        """Behind and above the first camera, or outside a scene without cameras."""
+        """At the first camera, where the map is at its best, or outside a scene without cameras."""
         if self.scene.cameras:
-            _, position = shown_pose(self.scene.cameras[0].world_from_cam, self.scene.scale)
-            forward = self.scene.cameras[0].world_from_cam[:3, 2]
-            with client.atomic():
-                client.camera.position = position - 0.9 * forward + 0.5 * self.scene.up
-                client.camera.look_at = position + 1.5 * forward
+            first = self.scene.cameras[0]
+            move_client(client, first.world_from_cam, self.scene.scale, first.fov)
             return
         client.camera.position, client.camera.look_at = self._outside()
 
@@ -329,9 +326,9 @@ class Viewer:
     def _add_mesh(self) -> Any:
         if self.scene.mesh_file is None:
             return None
-        found = read_mesh_ply(self.scene.mesh_file)
-        mesh = trimesh.Trimesh(found.vertices, found.faces, vertex_colors=found.colors, process=False)
-        return self.server.scene.add_mesh_trimesh("/mesh", mesh, scale=self.scene.scale, visible=False)
+        wxyz = Rotation.from_matrix(self.scene.world_from_mesh).as_quat()[[3, 0, 1, 2]]
+        data = self.scene.mesh_file.read_bytes()
+        return self.server.scene.add_glb("/mesh", data, scale=self.scene.scale, wxyz=wxyz, visible=False)
 
 
 def legend_html(scene: ViewerScene) -> str:

@@ -101,7 +101,7 @@ def test_a_folder_of_videos_is_for_batch(tmp_path: Path) -> None:
     assert "but 2 videos, such as a.mp4: give one of them, or the folder to `msgs-slam batch`" in said
 
 
-@pytest.mark.parametrize(("word", "kind"), [("obj", "texture"), ("GLTF", "glb"), ("poses", "tum"), ("ply", "ply")])
+@pytest.mark.parametrize(("word", "kind"), [("texture", "mesh"), ("GLTF", "glb"), ("poses", "tum"), ("ply", "ply")])
 def test_kinds_of_files_by_the_names_of_their_formats(word: str, kind: str) -> None:
     assert KindOfFile(EXPORTS).convert(word, None, None) == kind
     assert invoke("export", "no_such_run", "--only", word).exit_code == 1, "no wrong usage"

@@ -55,7 +55,7 @@ def test_another_reader_finds_what_the_extension_says(tmp_path: Path) -> None:
     cloud = _cloud()
     write_gaussian_glb(tmp_path / "map.glb", cloud, ("floor",))
     gltf = pygltflib.GLTF2().load(str(tmp_path / "map.glb"))
-    assert gltf.extensionsUsed == [EXTENSION]
+    assert gltf.extensionsUsed == [EXTENSION, "KHR_materials_unlit"]
     primitive = gltf.meshes[0].primitives[0]
     assert primitive.mode == pygltflib.POINTS
     assert primitive.extensions[EXTENSION] == {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
@@ -87,7 +87,9 @@ def test_who_does_not_know_the_extension_sees_points(tmp_path: Path) -> None:
     write_gaussian_glb(tmp_path / "map.glb", cloud)
     points = next(iter(trimesh.load_scene(tmp_path / "map.glb").geometry.values()))
     np.testing.assert_allclose(points.vertices, cloud.means * (1, -1, -1), atol=1e-6)
-    np.testing.assert_allclose(points.colors[:, :3], np.clip(cloud.colors, 0, 1) * 255, atol=0.51)
+    colors = np.clip(cloud.colors, 0, 1)  # COLOR_0 is linear
+    light = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(points.colors[:, :3], light * 255, atol=1)
 
 
 def test_compressed_is_a_tenth_and_read_again(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import plyfile
+import pygltflib
 import pytest
 import trimesh
 
@@ -54,6 +55,11 @@ def test_ply_round_trip_and_foreign_readers(tmp_path: Path, sphere: tuple) -> No
     np.testing.assert_array_equal(loaded.vertices, vertices)
 
 
+def in_light(colors: np.ndarray) -> np.ndarray:
+    """What glTF's COLOR_0 has to be of sRGB 0..255: linear (2.0, 3.9.2). trimesh gives its numbers as they are."""
+    return 255 * np.where(colors <= 0.04045 * 255, colors / 255 / 12.92, ((colors / 255 + 0.055) / 1.055) ** 2.4)
+
+
 def test_glb_round_trip_and_foreign_reader(tmp_path: Path, sphere: tuple) -> None:
     vertices, faces, colors, labels = sphere
     path = tmp_path / "mesh.glb"
@@ -62,7 +68,12 @@ def test_glb_round_trip_and_foreign_reader(tmp_path: Path, sphere: tuple) -> Non
     (mesh,) = scene.geometry.values()
     assert (mesh.faces == faces).all()
     np.testing.assert_array_equal(np.asarray(mesh.vertices, np.float32), vertices)
-    assert (mesh.visual.vertex_colors[:, :3] == colors).all()
+    np.testing.assert_allclose(255 * mesh.visual.vertex_attributes["color"][:, :3], in_light(colors), atol=1)
+    assert colors.std() > 5
+    (material,) = pygltflib.GLTF2().load_binary(str(path)).materials
+    assert material.doubleSided
+    assert (material.pbrMetallicRoughness.metallicFactor, material.pbrMetallicRoughness.roughnessFactor) == (0, 1)
+    assert "KHR_materials_unlit" in material.extensions
     assert (mesh.vertex_attributes["_LABEL"].ravel() == labels).all()
     assert mesh.metadata["classes"] == ["wall", "floor"]
 
@@ -146,9 +157,9 @@ def test_a_mesh_goes_from_ply_to_glb_in_blocks(tmp_path: Path, sphere: tuple, mo
     write_mesh_glb(tmp_path / "m.glb", mesh, ("wall",), turn)
     (found,) = trimesh.load_scene(str(tmp_path / "m.glb"), process=False).geometry.values()
     np.testing.assert_array_equal(np.asarray(found.vertices, np.float32), sphere[0] @ turn.T)
-    shown = (found.faces, found.visual.vertex_colors[:, :3], found.vertex_attributes["_LABEL"].ravel())
-    for ours, wanted in zip(shown, sphere[1:], strict=True):
-        np.testing.assert_array_equal(ours, wanted)
+    np.testing.assert_array_equal(found.faces, sphere[1])
+    np.testing.assert_allclose(255 * found.visual.vertex_attributes["color"][:, :3], in_light(sphere[2]), atol=1)
+    np.testing.assert_array_equal(found.vertex_attributes["_LABEL"].ravel(), sphere[3])
     (tmp_path / "m.ply").write_bytes((tmp_path / "m.ply").read_bytes()[:-1])
     with pytest.raises(InputError, match="export it again"):
         mesh_blocks(tmp_path / "m.ply")

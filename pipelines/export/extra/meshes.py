@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from ....formats.atomic import atomic_path, require_room
 from ....formats.errors import InputError, install_command
-from ....formats.glb import Part, write_primitive
+from ....formats.glb import Part, linear, material, write_primitive
 from ....formats.mesh import MeshArrays, read_mesh_ply
 from ...outcome import Outcome
 from ...run.files import MESH
@@ -56,7 +56,8 @@ def write_collision(outcome: Outcome, world: World, folder: Path) -> list[Path]:
     if world.axes == "up" and world.has_floor:
         points, faces = with_floor(points, faces)
     parts = [Part.of("POSITION", points @ world.gltf_from_exported.T), Part.of("", faces.astype(np.uint32).ravel())]
-    write_primitive(folder / COLLISION, parts, {"mode": 4}, (), {"name": "collision"})
+    extras = {"materials": [material(unlit=False)]}
+    write_primitive(folder / COLLISION, parts, {"mode": 4, "material": 0}, (), {"name": "collision"}, extras)
     return [folder / COLLISION]
 
 
@@ -117,14 +118,14 @@ def _fill(shape: Any, mesh: MeshArrays, names: tuple[str, ...], points: NDArray[
     """Triangles, linear colours, and the number of each vertex's class as the primvar `label`."""
     from pxr import Sdf, UsdGeom, Vt
 
-    colors = mesh.colors.astype(np.float32) / 255
-    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    colors = linear(mesh.colors / 255)
     shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
     shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
     shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.astype(np.int32).ravel()))
     shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    shape.CreateDoubleSidedAttr(True)
     shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
-    shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(linear))
+    shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(colors))
     labels = UsdGeom.PrimvarsAPI(shape).CreatePrimvar("label", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.vertex)
     labels.Set(Vt.IntArray.FromNumpy(mesh.labels.astype(np.int32)))
     shape.GetPrim().SetCustomDataByKey("classes", Vt.StringArray(list(names)))

@@ -3,14 +3,13 @@
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from ....formats.mesh import MeshArrays, TexturedMesh, write_textured_glb, write_textured_obj
+from ....formats.mesh import MeshArrays, TexturedMesh
 from ...compute.threads import for_each
 from ...geometry.camera import project
 from ...geometry.posed_depth import PosedDepth
@@ -222,16 +221,6 @@ def make_textured(outcome: Outcome, mesh: MeshArrays, views: Sequence[PosedDepth
     texture = paint_texture(atlas, shots, progress)
     uv = (atlas.corners / (atlas.width, atlas.height)).astype(np.float32)
     return TexturedMesh(light.vertices, light.labels, atlas.corner_vertex, uv, atlas.corner_faces, texture)
-
-
-def write_textured(
-    mesh: TexturedMesh, class_names: tuple[str, ...], folder: Path, gltf_from_world: NDArray[np.float64]
-) -> list[Path]:
-    """mesh_textured.obj with its .mtl and .png, and mesh_textured.glb in axes that gltf_from_world (3, 3) turns to."""
-    paths = write_textured_obj(folder / "mesh_textured.obj", mesh, class_names)
-    turned = replace(mesh, vertices=(mesh.vertices @ gltf_from_world.T).astype(np.float32))
-    write_textured_glb(folder / "mesh_textured.glb", turned, class_names)
-    return [*paths, folder / "mesh_textured.glb"]
 
 
 def _shots(outcome: Outcome, views: Sequence[PosedDepth]) -> Sequence[Shot]:
