@@ -20,8 +20,8 @@ FORBIDDEN = {
 FLOORS = (
     {"config", "types"}, {"geometry", "read_config"}, {"providers", "system"}, {"compute"},
     {"render", "networks"}, {"depth"}, {"doctor", "run", "sfm"}, {"engine", "source"},
-    {"labels", "masks"}, {"frames", "proxy"}, {"mapping", "tracking"}, {"global_ba", "outcome", "status"}, {"scene"},
-    {"export"}, {"reconstruct"}, {"batch", "evaluation"}, {"demo", "viewer"},
+    {"labels", "masks"}, {"frames", "proxy"}, {"mapping", "tracking"}, {"global_ba", "outcome", "status"},
+    {"paper", "scene"}, {"export"}, {"reconstruct"}, {"batch", "evaluation"}, {"demo", "viewer"},
 )  # fmt: skip
 """The rooms of pipelines/: its folders and its flat files, each above all that it imports."""
 MOST_FLAT = 10

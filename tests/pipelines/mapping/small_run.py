@@ -27,16 +27,16 @@ from msgs_slam.pipelines.types import VOID, Calibration, ClassTable, Frame, Intr
 SIZE = (80, 60)
 
 
-def make_run(root: Path, sequence: Path, every: int = 2) -> RunFolder:
-    """Every second frame at 80 x 60, all of them keyframes; labels and metric depth are the truth."""
+def make_run(root: Path, sequence: Path, every: int = 2, most: int = 1000) -> RunFolder:
+    """Every second frame at 80 x 60, at most so many, all of them keyframes; labels and metric depth are the truth."""
     run = RunFolder(root)
     camera = json.loads((sequence / "intrinsics.json").read_text())
     full = read_rgb(sequence / "rgb" / "000000.png").shape[1::-1]
     k = Intrinsics(*full, camera["fx"], camera["fy"], camera["cx"] + 0.5, camera["cy"] + 0.5).resized(*SIZE)
     rows = json.loads((sequence / "classes.json").read_text())["classes"]
-    world_from_cam = np.loadtxt(sequence / "traj.txt").reshape(-1, 4, 4)[::every]
-    times = np.loadtxt(sequence / "timestamps.txt").reshape(-1)[::every]
-    names = sorted(p.name for p in (sequence / "rgb").iterdir())[::every]
+    world_from_cam = np.loadtxt(sequence / "traj.txt").reshape(-1, 4, 4)[::every][:most]
+    times = np.loadtxt(sequence / "timestamps.txt").reshape(-1)[::every][:most]
+    names = sorted(p.name for p in (sequence / "rgb").iterdir())[::every][:most]
     frames = [Frame(i, n, float(t), i * every, 1.0) for i, (n, t) in enumerate(zip(names, times, strict=True))]
     depths = []
     for frame in frames:

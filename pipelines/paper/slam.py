@@ -1,0 +1,183 @@
+"""Figure 1 of the paper: for each frame predict, track, select, grow, optimise; loops and adjustment: `stages`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..depth.fields import FINE, field_scales
+from ..geometry import se3
+from ..geometry.camera import unproject_depth
+from ..mapping.views import View
+from ..render.api import Rendering
+from .constants import PAPER, Constants
+from .gaussians import Gaussians, scaled_depth, show
+from .keyframes import overlap, select, semantic_keyframes, time_weights
+from .mapping import grow, optimise, prune
+from .tracking import predict, track
+from .uncertainty import agreement, semantic_agreement, with_agreement
+
+STEPS, FIRST_STEPS = 15, 60
+"""Of mapping, after each keyframe and after the first."""
+PRUNE_EVERY = 10
+_GRID = (40, 30)
+_STRIDE = 8
+_COVERED = 0.1
+"""A frame of which the map covers less is lost."""
+
+
+@dataclass
+class Slam:
+    """All that is known after a frame; tables by frame id. fields: log scales (rows, columns) that bring a keyframe's
+    proxy depth into the map; looks: its labels (30, 40) and mean U."""
+
+    classes: int
+    seed: int
+    unit: float = 1.0
+    gaussians: Gaussians | None = None
+    poses: dict[int, Tensor] = field(default_factory=dict)
+    fields: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    looks: dict[int, tuple[NDArray[np.uint8], float]] = field(default_factory=dict)
+    lost: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def keyframes(self) -> list[int]:
+        """Frame ids in order."""
+        return list(self.fields)
+
+    def step(self, view: View, view_of: Callable[[int], View], may_map: bool, constants: Constants = PAPER) -> None:
+        """One frame of figure 1; `view_of` a keyframe, by its id, `may_map`: not for a frame that only measures."""
+        if self.gaussians is None:
+            if may_map and bool((view.depth > 0).any()):
+                self._begin(view)
+                self._optimise(view_of, FIRST_STEPS, [view.frame_id], constants)
+            return
+        starts = self._starts()
+        found = track(self.gaussians, self._scaled(view), starts, self.classes, self.unit, self.seed + view.frame_id)
+        if found.covered < _COVERED:
+            self.lost[view.frame_id] = "the map covers too little of it"
+            return
+        pose = self.poses[view.frame_id] = found.cam_from_world
+        if not (may_map and self._is_new(view, pose, constants)):
+            return
+        with torch.no_grad():
+            shown = show(vars(self.gaussians.map.only(self.gaussians.in_view(pose, view.intrinsics))), pose, view)
+        view = self._agreeing(view, shown, constants)
+        self.fields[view.frame_id] = fitted_field(view, shown.depth.numpy(), shown.silhouette.numpy() > constants.t_sil)
+        self.looks[view.frame_id] = _looks(view)
+        grow(self.gaussians, self._scaled(view), pose, self.classes, constants)
+        chosen = self._select(view, pose, constants)
+        self._optimise(view_of, STEPS, chosen, constants)
+        if len(self.fields) % PRUNE_EVERY == 0:
+            prune(self.gaussians, self.unit)
+
+    def _begin(self, view: View) -> None:
+        """First pose = identity; the scale is that of the proxy depth."""
+        self.unit = float(view.depth[view.depth > 0].median())
+        self.poses[view.frame_id] = torch.eye(4, dtype=torch.float64)
+        self.fields[view.frame_id], self.looks[view.frame_id] = np.zeros((FINE.rows, FINE.columns)), _looks(view)
+        self.gaussians = grow(None, view, self.poses[view.frame_id], self.classes)
+
+    def _starts(self) -> list[Tensor]:
+        """By (15), and where the last frame was: of sudden turns that is nearer."""
+        *before, last = list(self.poses.values())[-2:]
+        return [predict(before[0], last), last] if before else [last]
+
+    def _scaled(self, view: View) -> View:
+        """With its proxy depth in the scale of the map, as its own or the last keyframe's field says."""
+        nodes = self.fields.get(view.frame_id, self.fields[self.keyframes[-1]])
+        return scaled_depth(view, torch.from_numpy(field_scales(nodes, *view.depth.shape)))
+
+    def _is_new(self, view: View, pose: Tensor, constants: Constants) -> bool:
+        last = self.poses[self.keyframes[-1]].numpy()
+        has_depth = bool((view.depth > 0).any())
+        return has_depth and overlap(self._points(view, pose), last, view.intrinsics) < constants.new_keyframe
+
+    def _points(self, view: View, pose: Tensor) -> NDArray[np.float64]:
+        """(P, 3) some of a frame's back-projected pixels."""
+        points = unproject_depth(self._scaled(view).depth.numpy(), view.intrinsics)[::_STRIDE, ::_STRIDE].reshape(-1, 3)
+        world_from_cam = se3.inverse(pose.numpy())
+        return points[points[:, 2] > 0] @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+
+    def _agreeing(self, view: View, shown: Rendering, constants: Constants) -> View:
+        """U with θ^γ of (3), by how well the map shows the classes of the frame."""
+        if self.classes == 0:
+            return view
+        channels = shown.features[..., 3:].argmax(-1).to(torch.uint8)
+        channels = torch.where(shown.silhouette > constants.t_sil, channels, view.channels)
+        theta = agreement(semantic_agreement(view.channels.numpy(), channels.numpy()), constants)
+        weighed = with_agreement(view.reliability.numpy().astype(np.float64), theta, constants)
+        return replace(view, reliability=torch.from_numpy(np.round(weighed).astype(np.uint8)))
+
+    def _select(self, view: View, pose: Tensor, constants: Constants) -> list[int]:
+        """The frame itself, and at most 20 keyframes by (10) to (14)."""
+        others = [k for k in self.keyframes if k != view.frame_id]
+        points = self._points(view, pose)
+        overlaps = [overlap(points, self.poses[k].numpy(), view.intrinsics) for k in others]
+        differs = semantic_keyframes(self.looks[view.frame_id][0], np.stack([self.looks[k][0] for k in others]))
+        ages = np.arange(len(others), 0, -1)
+        weights = time_weights(ages, np.array([self.looks[k][1] for k in others]), constants)
+        rng = np.random.default_rng([self.seed, view.frame_id])
+        return [view.frame_id, *(others[i] for i in select(overlaps, differs, weights, rng, constants))]
+
+    def _optimise(self, view_of: Callable[[int], View], steps: int, chosen: list[int], constants: Constants) -> None:
+        """Steps on (18), every other by the frame itself, the first of the chosen."""
+        assert self.gaussians is not None
+        rng = np.random.default_rng([self.seed, chosen[0], 1])
+        for number in range(steps):
+            k = chosen[0] if number % 2 == 0 else chosen[int(rng.integers(len(chosen)))]
+            optimise(self.gaussians, self._scaled(view_of(k)), self.poses[k], self.classes, self.unit, 1.0, constants)
+
+    def to_tensors(self) -> dict[str, Tensor]:
+        """A flat table for a snapshot; `from_tensors` is the inverse."""
+        if self.gaussians is None:
+            return {}
+        numbers = {
+            "unit": torch.tensor(self.unit, dtype=torch.float64), "posed": torch.tensor(list(self.poses)),
+            "poses": torch.stack(list(self.poses.values())), "keyframes": torch.tensor(self.keyframes),
+            "fields": torch.from_numpy(np.stack(list(self.fields.values()))),
+            "labels": torch.from_numpy(np.stack([labels for labels, _ in self.looks.values()])),
+            "trust": torch.tensor([trust for _, trust in self.looks.values()], dtype=torch.float64),
+            "lost": torch.tensor(list(self.lost), dtype=torch.int64),
+        }  # fmt: skip
+        return {**self.gaussians.to_tensors(), **numbers}
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take what `to_tensors` returned."""
+        self.gaussians, self.unit = Gaussians.from_tensors(tensors), float(tensors["unit"])
+        keyframes = tensors["keyframes"].tolist()
+        self.poses = dict(zip(tensors["posed"].tolist(), tensors["poses"], strict=True))
+        self.fields = dict(zip(keyframes, tensors["fields"].numpy(), strict=True))
+        looks = zip(tensors["labels"].numpy(), tensors["trust"].tolist(), strict=True)
+        self.looks = dict(zip(keyframes, looks, strict=True))
+        self.lost = dict.fromkeys(tensors["lost"].tolist(), "the map covers too little of it")
+
+
+def _looks(view: View) -> tuple[NDArray[np.uint8], float]:
+    labels = np.asarray(cv2.resize(view.channels.numpy(), _GRID, interpolation=cv2.INTER_NEAREST), np.uint8)
+    return labels, float(view.trust.mean())
+
+
+def fitted_field(view: View, shown: NDArray[np.float32], solid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(rows, columns) the log scale field from a view's proxy depth to a shown one (H, W) where that is solid.
+
+    Smooth, and as it is on the whole where the map shows nothing."""
+    proxy, trust = view.depth.numpy(), view.trust.numpy()
+    weight = np.where(solid & (proxy > 0) & (shown > 0), trust, 0).astype(np.float32)
+    logs = np.log(np.where(weight > 0, shown / np.where(proxy > 0, proxy, 1), 1)).astype(np.float32)
+    if not (weight > 0).any():
+        return np.zeros((FINE.rows, FINE.columns))
+    middle = float(np.median(logs[weight > 0]))
+    weight *= np.abs(logs - middle) < 0.3  # across the edge of something
+    size = (FINE.columns, FINE.rows)
+    blurred = [
+        cv2.GaussianBlur(a, (0, 0), proxy.shape[1] / FINE.columns / 2) for a in (weight * (logs - middle), weight)
+    ]
+    total, share = (cv2.resize(a, size, interpolation=cv2.INTER_AREA).astype(np.float64) for a in blurred)
+    return middle + total / (share + 0.05)

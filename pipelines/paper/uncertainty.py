@@ -1,0 +1,114 @@
+"""Proxy depth, how far it is to be trusted, and what symmetry says of it (section 3.1)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..proxy.maps import EDGE_STEP, mean_iou, squared_log_gradient
+from ..run.folder import RunFolder
+from ..types import ProxyMaps
+from .constants import PAPER, Constants
+
+Array = NDArray[np.float64]
+_SYMMETRY_POINTS = 2000
+_SYMMETRY_PROPOSALS = 60
+
+
+def proxy_depth(run: RunFolder, frame_id: int) -> ProxyMaps | None:
+    """Eq. (1): D̂_t = Metric3D-V2(I_t): what the stage `proxy` has stored of a frame, None where it gave it no maps.
+
+    Which network, or which files, is the setting `proxy.depth`."""
+    return run.find_proxy(frame_id)
+
+
+def reliability(
+    depth: NDArray[np.float32], confidence: NDArray[np.float32], theta: float = 1.0, constants: Constants = PAPER
+) -> NDArray[np.float32]:
+    """Eq. (2): U = exp(-α‖∇D̂‖²) · Conf^β · θ^γ, (h, w) in [0, 1] of depth and confidence (h, w); 0 at unknown depth.
+
+    Printed β and γ are factors; U could then not pass 0.4, and so never the thresholds printed. The gradient is that of
+    the logarithm, in steps of a tenth, so that U does not depend on the unit.
+    """
+    edges = np.exp(-constants.alpha * squared_log_gradient(depth) / EDGE_STEP**2)
+    u = edges * np.clip(confidence, 0, 1) ** constants.beta
+    return np.asarray(np.where(depth > 0, with_agreement(u, theta, constants), 0), np.float32)
+
+
+def agreement(miou: float, constants: Constants = PAPER) -> float:
+    """Eq. (3): θ = 1 / (1 + exp(-λ(m_t - φ))) of the mIoU m_t of a frame's classes with those that the map shows."""
+    return float(1 / (1 + np.exp(-constants.steepness * (miou - constants.phi))))
+
+
+def with_agreement(u: NDArray, theta: float, constants: Constants = PAPER) -> NDArray:
+    """U of Eq. (2) without its last factor -> with θ^γ."""
+    return u * theta**constants.gamma
+
+
+def semantic_agreement(labels: NDArray[np.uint8], shown: NDArray[np.uint8]) -> float:
+    """m_t of Eq. (3): mIoU of two label images (h, w)."""
+    return float(mean_iou(labels, shown[None])[0])
+
+
+def reliability_class(u: NDArray, constants: Constants = PAPER) -> NDArray[np.int64]:
+    """(h, w) 2 where U is high (depth leads), 1 where it is medium, 0 where it is low (colour and semantics lead)."""
+    return np.digitize(u, [constants.tau_low, constants.tau_high], right=True)
+
+
+@dataclass(frozen=True)
+class MirrorPlane:
+    """Points x with normal · x = offset; confidence in [0, 1], 0 where no symmetry stands out from chance."""
+
+    normal: Array
+    offset: float
+    confidence: float
+
+
+def mirror_plane(points: Array, classes: NDArray[np.integer], tolerance: float, seed: int) -> MirrorPlane:
+    """Find the plane that maps most points (P, 3) onto points of the same class (P,), within a tolerance.
+
+    Proposed by pairs of one class; the confidence is the share of points that find a partner beyond what as many do for
+    the median proposal, which is chance. Section 3.1 asks that it switches itself off where there is no symmetry.
+    """
+    rng = np.random.default_rng(seed)
+    rows = rng.permutation(len(points))[:_SYMMETRY_POINTS]
+    points, classes = points[rows], classes[rows]
+    spread = np.ptp(points, axis=0).max(initial=0) if len(points) else 0.0
+    spaced = np.column_stack([points, classes * (10 * spread + 1)])
+    tree, shares, planes = cKDTree(spaced), [], []
+    for _ in range(_SYMMETRY_PROPOSALS if len(points) > 1 else 0):
+        first, second = points[rng.choice(len(points), 2, replace=False)]
+        if (apart := np.linalg.norm(second - first)) < 10 * tolerance:
+            continue
+        normal = (second - first) / apart
+        offset = float(normal @ (first + second) / 2)
+        beside = np.abs(points @ normal - offset) > 2 * tolerance  # what lies on the plane mirrors itself
+        near, _ = tree.query(mirrored(spaced, normal, offset), distance_upper_bound=tolerance)
+        shares.append(float((np.isfinite(near) & beside).sum()) / len(points))
+        planes.append((normal, offset))
+    if not planes:
+        return MirrorPlane(np.array([1.0, 0, 0]), 0.0, 0.0)
+    best, chance = int(np.argmax(shares)), float(np.median(shares))
+    confidence = max(shares[best] - chance - 0.3, 0.0) / 0.7
+    return MirrorPlane(*planes[best], confidence)
+
+
+def mirrored(points: Array, normal: Array, offset: float) -> Array:
+    """(P, 3 or more) points with the first three columns mirrored by the plane."""
+    out = points.copy()
+    out[:, :3] -= 2 * (points[:, :3] @ normal - offset)[:, None] * normal
+    return out
+
+
+def symmetry_pull(points: Array, classes: NDArray[np.integer], plane: MirrorPlane, tolerance: float) -> Array:
+    """(P, 3) the points drawn half way to their mirrored partners of the same class, as far as the plane is sure."""
+    if plane.confidence == 0 or len(points) == 0:
+        return points
+    spread = np.ptp(points, axis=0).max()
+    spaced = np.column_stack([points, classes * (10 * spread + 1)])
+    near, partner = cKDTree(mirrored(spaced, plane.normal, plane.offset)).query(spaced, distance_upper_bound=tolerance)
+    found, out = np.isfinite(near), points.copy()
+    theirs = mirrored(points, plane.normal, plane.offset)[partner[found]]
+    out[found] += 0.5 * plane.confidence * (theirs - points[found])
+    return out

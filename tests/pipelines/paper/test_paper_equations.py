@@ -1,0 +1,478 @@
+"""Every numbered equation of the paper: hand-made cases, limits and finite differences; and that none is missing."""
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from msgs_slam.pipelines import paper
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.global_ba.candidates import summarise_labels
+from msgs_slam.pipelines.mapping.seeding import seed_gaussians
+from msgs_slam.pipelines.mapping.views import View, make_view
+from msgs_slam.pipelines.paper import adjustment, keyframes, loops, mapping, rendering, tracking, uncertainty
+from msgs_slam.pipelines.paper.constants import PAPER
+from msgs_slam.pipelines.paper.gaussians import Gaussians, semantic_image, show
+from msgs_slam.pipelines.render.api import Rendering
+from msgs_slam.pipelines.types import VOID, Intrinsics, LoopEdge, ProxyMaps
+
+CAMERA = Intrinsics(48, 36, 40.0, 40.0, 24.0, 18.0)
+
+
+def a_view(frame_id: int = 0, shift: float = 0.0, camera: Intrinsics = CAMERA) -> View:
+    """A bumpy textured wall two units away, of two classes; `shift`: how far the camera stands to the right."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    at = (x - camera.cx) / camera.fx * 2 + shift
+    down = (y - camera.cy) / camera.fy * 2
+    waves = [np.sin(9 * at + 3 * np.sin(5 * down)), np.sin(7 * down + 2 * at), np.cos(11 * at - 4 * down)]
+    image = (255 * (0.5 + 0.4 * np.stack(waves, -1))).astype(np.uint8)
+    labels = (at > 0.1).astype(np.uint8)
+    ones = np.ones(labels.shape, np.float32)
+    return make_view(frame_id, camera, np.eye(4), image, ProxyMaps(2 * ones, ones, labels, ones), (0, 1))
+
+
+def a_map(view: View, pose: Tensor | None = None) -> Gaussians:
+    return mapping.grow(None, view, torch.eye(4, dtype=torch.float64) if pose is None else pose, 2)
+
+
+def test_every_equation_has_a_function_that_names_it() -> None:
+    texts = [p.read_text(encoding="utf-8") for p in Path(paper.__file__).parent.glob("*.py")]
+    named = {
+        int(n) for text in texts for n in re.findall(r'"""(?:\w+ )*(?:term|condition)?(?: of )?Eqs?\. \((\d+)\)', text)
+    }
+    assert named == set(range(1, 27))
+
+
+# (1) to (3) -----------------------------------------------------------------------------------------------------
+
+
+def test_1_proxy_depth_is_what_the_stage_has_stored() -> None:
+    class Run:
+        def find_proxy(self, frame_id: int) -> int:
+            return frame_id
+
+    assert uncertainty.proxy_depth(Run(), 7) == 7  # type: ignore[arg-type]
+
+
+def test_2_reliability_by_hand() -> None:
+    flat, half = np.full((6, 6), 2, np.float32), np.full((6, 6), 0.5, np.float32)
+    assert np.allclose(uncertainty.reliability(flat, half), 0.5**0.8)
+    assert np.allclose(uncertainty.reliability(flat, half, theta=0.25), 0.5**0.8 * 0.25**0.5, atol=1e-6)
+    step = flat.copy()
+    step[:, 3:] *= math.exp(0.1)
+    beside = uncertainty.reliability(step, np.ones((6, 6), np.float32))
+    assert np.allclose(beside[:, 2], math.exp(-0.7))
+    assert np.allclose(beside[:, 0], 1)
+    assert (uncertainty.reliability(np.zeros((6, 6), np.float32), half) == 0).all()
+    assert np.allclose(uncertainty.reliability(1000 * step, half), uncertainty.reliability(step, half))
+    assert uncertainty.reliability_class(np.array([0.2, 0.35, 0.6, 0.9])).tolist() == [0, 0, 1, 2]
+
+
+def test_3_agreement_is_a_rising_step_around_phi() -> None:
+    assert uncertainty.agreement(PAPER.phi) == 0.5
+    values = [uncertainty.agreement(m) for m in np.linspace(0, 1, 9)]
+    assert values == sorted(values)
+    assert values[0] < 0.01
+    assert values[-1] > 0.99
+    labels = np.array([[0, 0], [1, 1]], np.uint8)
+    assert uncertainty.semantic_agreement(labels, labels) == 1
+    assert uncertainty.semantic_agreement(labels, np.array([[0, 0], [1, 0]], np.uint8)) == pytest.approx(
+        (2 / 3 + 1 / 2) / 2
+    )
+
+
+def test_symmetry_is_found_where_it_is_and_off_where_it_is_not() -> None:
+    rng = np.random.default_rng(0)
+    half = rng.uniform([0.2, -1, -1], [1.5, 1, 1], (150, 3))
+    both, classes = np.concatenate([half, half * [-1, 1, 1]]), np.tile(rng.integers(0, 3, 150), 2)
+    found = [uncertainty.mirror_plane(both, classes, 0.02, seed) for seed in range(60)]
+    best = max(found, key=lambda plane: plane.confidence)
+    assert best.confidence > 0.5
+    assert abs(abs(best.normal[0]) - 1) < 1e-6
+    assert abs(best.offset) < 1e-6
+    shaken = both + rng.normal(0, 0.005, both.shape)
+    pulled = uncertainty.symmetry_pull(shaken, classes, best, 0.05)
+    assert 0 < np.abs(pulled - both).mean() < 0.95 * np.abs(shaken - both).mean()
+    chaos = rng.uniform(-1, 1, (300, 3))
+    nothing = uncertainty.mirror_plane(chaos, rng.integers(0, 3, 300), 0.02, 0)
+    assert nothing.confidence == 0
+    assert (uncertainty.symmetry_pull(chaos, classes, nothing, 0.05) == chaos).all()
+
+
+# (4) to (9) -----------------------------------------------------------------------------------------------------
+
+
+def test_4_density_at_the_centre_and_a_radius_away() -> None:
+    points = torch.tensor([[1.0, 0, 0], [1, 0.5, 0], [1, 0, 1]])
+    f = rendering.density(points, torch.tensor([1.0, 0, 0]), torch.tensor(0.5), torch.tensor(0.8))
+    assert torch.allclose(f, 0.8 * torch.exp(torch.tensor([0, -0.5, -2.0])))
+
+
+def test_5_projection_by_hand() -> None:
+    pose = torch.eye(4)
+    pose[2, 3] = 1
+    xy, radius, depth = rendering.projection(torch.tensor([[0.5, -0.25, 1.0]]), torch.tensor([0.1]), pose, CAMERA)
+    assert torch.allclose(xy, torch.tensor([[40 * 0.25 + 24, -40 * 0.125 + 18]]))
+    assert torch.allclose(radius, torch.tensor([40 * 0.1 / 2]))
+    assert depth.tolist() == [2.0]
+
+
+def stack() -> tuple[Tensor, Tensor]:
+    """f and d of three Gaussians of one pixel, near to far."""
+    return torch.tensor([0.5, 0.25, 0.8], dtype=torch.float64), torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)
+
+
+def test_6_8_and_9_blend_front_to_back() -> None:
+    f, _ = stack()
+    weights = torch.tensor([0.5, 0.5 * 0.25, 0.5 * 0.75 * 0.8], dtype=torch.float64)
+    colors, classes = torch.rand(3, 3, dtype=torch.float64), torch.rand(3, 5, dtype=torch.float64)
+    assert torch.allclose(rendering.blend_color(colors, f), weights @ colors)
+    assert torch.allclose(rendering.blend_semantics(classes, f), weights @ classes)
+    assert torch.allclose(rendering.blend_silhouette(f), weights.sum())
+    assert torch.allclose(rendering.blend_silhouette(f), 1 - torch.prod(1 - f))
+
+
+def test_7_an_occluder_that_disagrees_with_the_proxy_hides_less() -> None:
+    f, d = stack()
+    proxy = torch.tensor(4.0, dtype=torch.float64)
+    ordinary = rendering.blend_color(d[:, None], f)[0]
+    assert torch.allclose(rendering.blend_depth(d, f, proxy, 0.0), ordinary)
+    hidden = [0.5 * math.exp(-9.0), 0.25 * math.exp(-4.0)]
+    expected = 0.5 + 2 * 0.25 * (1 - hidden[0]) + 4 * 0.8 * (1 - hidden[0]) * (1 - hidden[1])
+    assert float(rendering.blend_depth(d, f, proxy, 1.0)) == pytest.approx(expected)
+    assert torch.allclose(rendering.blend_depth(d, f, torch.zeros(()).double(), 1.0), ordinary)
+    assert torch.autograd.gradcheck(
+        lambda a, b: rendering.blend_depth(a, b, proxy, 0.7), (d.requires_grad_(), f.requires_grad_())
+    )
+
+
+def test_the_renderer_draws_these_equations() -> None:
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(6, 3, generator=generator) * torch.tensor([0.2, 0.2, 1.0]) + torch.tensor([-0.1, -0.1, 1.5])
+    radii, opacities = torch.full((6,), 0.3), torch.rand(6, generator=generator) * 0.8 + 0.1
+    features, pose = torch.rand(6, 5, generator=generator), torch.eye(4)
+    shown = rendering.draw(means, radii, opacities, features, pose, CAMERA)
+    xy, radius, depth = rendering.projection(means, radii, pose, CAMERA)
+    order = torch.argsort(depth)
+    pixel = torch.tensor([20.5, 15.5])
+    f = torch.stack([rendering.density(pixel, xy[i], radius[i], opacities[i]) for i in order])
+    assert torch.allclose(shown.features[15, 20, :3], rendering.blend_color(features[order, :3], f), atol=1e-5)
+    assert torch.allclose(shown.features[15, 20, 3:], rendering.blend_semantics(features[order, 3:], f), atol=1e-5)
+    assert torch.allclose(shown.silhouette[15, 20], rendering.blend_silhouette(f), atol=1e-5)
+    proxy = torch.full((36, 48), 2.2)
+    for kappa in (0.0, 3.0):
+        drawn = rendering.weighted_depth(means, radii, opacities, pose, CAMERA, proxy, kappa)
+        above, below = (rendering.blend_depth(d, f, proxy[0, 0], 0.0) for d in (depth[order], torch.ones(6)))
+        if kappa:
+            weights = torch.cumprod(1 - f * rendering.occluder_weight(depth[order], proxy[0, 0], kappa), 0)
+            below = (f * torch.cat([torch.ones(1), weights[:-1]])).sum()
+            above = rendering.blend_depth(depth[order], f, proxy[0, 0], kappa)
+        assert torch.allclose(drawn[15, 20], above / below, atol=1e-5)
+    ordinary = rendering.weighted_depth(means, radii, opacities, pose, CAMERA, proxy, 0.0)
+    assert torch.allclose(ordinary, shown.depth, atol=1e-4)
+
+
+# (10) to (14) ---------------------------------------------------------------------------------------------------
+
+
+def test_10_and_11_overlap_counts_points_in_the_image() -> None:
+    points = np.array([[0, 0, 2.0], [0.5, 0, 2], [5, 0, 2], [0, 0, -2]])
+    assert keyframes.overlap(points, np.eye(4), CAMERA) == 0.5
+    assert keyframes.overlap(points[:0], np.eye(4), CAMERA) == 0
+    assert keyframes.geometric_keyframes([0.5, 0.08, 0.081, 0.0]) == [0, 2]
+
+
+def test_12_keeps_those_that_show_something_else() -> None:
+    own = np.zeros((4, 4), np.uint8)
+    half = own.copy()
+    half[2:] = 1
+    assert keyframes.semantic_keyframes(own, np.stack([own, half, own + 1])).tolist() == [False, True, True]
+
+
+def test_13_and_14_older_and_less_reliable_keyframes_weigh_less() -> None:
+    ages = np.array([0, 1, 10])
+    assert np.allclose(keyframes.time_weights(ages, np.ones(3)), np.exp(-0.1 * ages))
+    assert np.allclose(keyframes.depth_certainty(np.array([1.0, 0.5, 0.0])), np.exp([0, -0.5, -1]))
+
+
+def test_selection_is_at_most_twenty_drawn_by_weight_and_repeatable() -> None:
+    overlaps, differs, weights = [0.5] * 60, np.ones(60, bool), np.r_[np.zeros(30) + 1e-9, np.ones(30)]
+    chosen = keyframes.select(overlaps, differs, weights, np.random.default_rng(1))
+    assert len(set(chosen)) == 20
+    assert min(chosen) >= 30
+    assert chosen == keyframes.select(overlaps, differs, weights, np.random.default_rng(1))
+    assert keyframes.select([0.5, 0.0, 0.4], np.zeros(3, bool), np.ones(3), np.random.default_rng(1)) == [0, 2]
+    assert keyframes.select([0.5, 0.5], np.array([False, True]), np.ones(2), np.random.default_rng(1)) == [1]
+
+
+# (15), (16) -----------------------------------------------------------------------------------------------------
+
+
+def test_15_constant_velocity_goes_on() -> None:
+    step = se3.exp(torch.tensor([0.1, 0, 0.02, 0, 0.05, 0.01], dtype=torch.float64))
+    first = se3.exp(torch.tensor([0.3, 0.1, 0, 0.2, 0, 0], dtype=torch.float64))
+    assert torch.allclose(tracking.predict(first, step @ first), step @ step @ first)
+    assert torch.allclose(tracking.predict(first, first), first)
+
+
+def test_16_tracking_loss_by_hand() -> None:
+    view = a_view()
+    truth = semantic_image(view, 2)
+    features = torch.cat([view.colors + 0.1, truth], -1)
+    seen = torch.ones(36, 48)
+    assert (
+        float(
+            tracking.tracking_loss(Rendering(torch.cat([view.colors, truth], -1), view.depth, seen), view, truth, 2.0)
+        )
+        == 0
+    )
+    shown = Rendering(features, view.depth + 0.5, seen)
+    assert float(tracking.tracking_loss(shown, view, truth, 2.0)) == pytest.approx(0.1 + 0.8 * 0.25, rel=1e-4)
+    wrong = Rendering(torch.cat([view.colors, truth.flip(-1)], -1), view.depth, seen)
+    assert float(tracking.tracking_loss(wrong, view, truth, 2.0)) == pytest.approx(0.3)
+    half = torch.where(torch.arange(48) < 24, 0.9, 1.0).expand(36, 48)  # below T_sil nothing counts
+    broken = replace(shown, features=torch.where(half[..., None] < 0.95, 7.0, features), silhouette=half)
+    assert float(tracking.tracking_loss(broken, view, truth, 2.0)) == pytest.approx(0.3, rel=1e-4)
+
+
+def test_16_finds_a_pose_again() -> None:
+    view = a_view(camera=CAMERA.resized(160, 120))
+    gaussians, identity = a_map(view), torch.eye(4, dtype=torch.float64)
+    for _ in range(20):  # seeds are not opaque yet
+        mapping.optimise(gaussians, view, identity, 2, 2.0)
+    start = se3.exp(torch.tensor([0.03, -0.02, 0.02, 0.01, -0.01, 0.01], dtype=torch.float64))
+
+    def pixels_off(pose: Tensor) -> float:
+        """Of the wall's points: a turn and a shift that look alike are as good."""
+        points = torch.cartesian_prod(torch.linspace(-2, 2, 5), torch.linspace(-1.5, 1.5, 5), torch.tensor([2.0]))
+        there, _, _ = rendering.projection(points, torch.ones(25), pose, view.intrinsics)
+        return float(
+            (there - rendering.projection(points, torch.ones(25), identity, view.intrinsics)[0]).norm(dim=1).mean()
+        )
+
+    found = tracking.track(gaussians, view, [start], 2, 2.0, 0)
+    assert 0 < pixels_off(found.cam_from_world) < 0.5
+    assert pixels_off(start) > 2
+    assert found.covered > 0.9
+    assert (found.cam_from_world == tracking.track(gaussians, view, [start], 2, 2.0, 0).cam_from_world).all()
+    assert pixels_off(tracking.track(gaussians, view, [start, identity], 2, 2.0, 0).cam_from_world) < 0.5
+
+
+# (17) to (20) ---------------------------------------------------------------------------------------------------
+
+
+def test_17_unreliable_depth_becomes_that_of_its_region() -> None:
+    depth, u = np.full((40, 40), 2, np.float32), np.ones((40, 40), np.float32)
+    depth[10:20, 10:20], u[10:20, 10:20] = 3, 0.1
+    channels = np.zeros((40, 40), np.uint8)
+    channels[:, 30:] = 1
+    out = mapping.depth_prior(depth, u, channels)
+    assert np.allclose(out[10:20, 10:20], 2, rtol=0.02)
+    assert np.allclose(mapping.depth_prior(depth, np.ones_like(u), channels), depth)  # reliable depth stays
+
+
+def test_18_map_loss_is_its_weighted_terms() -> None:
+    view = a_view()
+    truth = semantic_image(view, 2)
+    perfect = Rendering(torch.cat([view.colors, truth], -1), view.depth, torch.ones(36, 48))
+    small = torch.full((5,), -9.0)
+    edges = PAPER.map_edge * mapping.edge_loss(view.depth, view.channels, 2.0)
+    assert torch.allclose(mapping.map_loss(perfect, view, small, 2, 2.0), edges, atol=1e-5)
+    deeper = replace(perfect, depth=view.depth + 0.2)
+    assert float(mapping.map_loss(deeper, view, small, 2, 2.0) - edges) == pytest.approx(0.8 * 0.1, rel=1e-3)
+    unsure = replace(view, reliability=torch.full((36, 48), 51, dtype=torch.uint8))  # U = 0.2, w = 0.24
+    got = mapping.map_loss(deeper, unsure, small, 2, 2.0)
+    assert float(got) == pytest.approx(0.2 * (float(edges) + 0.8 * 0.24 * 0.1), rel=1e-3)
+    assert mapping.map_loss(perfect, view, torch.zeros(5), 2, 2.0) > edges + 1  # far too large
+
+
+def test_19_edges_pull_depth_together_inside_and_apart_across() -> None:
+    generator = torch.Generator().manual_seed(0)
+    depth = (2 + 0.02 * torch.rand(5, 6, generator=generator, dtype=torch.float64)).requires_grad_()
+    channels = torch.zeros(5, 6, dtype=torch.uint8)
+    assert torch.autograd.gradcheck(lambda d: mapping.edge_loss(d, channels, 2.0), (depth,))
+    step = torch.full((5, 6), 2.0)
+    step[:, 3:] = 2.05
+    across = channels.clone()
+    across[:, 3:] = 1
+    flat = torch.full((5, 6), 2.0)
+    assert mapping.edge_loss(step, across, 2.0) < mapping.edge_loss(flat, across, 2.0)
+    assert mapping.edge_loss(step, channels, 2.0) > mapping.edge_loss(flat, channels, 2.0)
+    assert float(mapping.edge_loss(step, torch.full_like(channels, VOID), 2.0)) == 0
+
+
+def test_20_weighs_the_difference_by_omega() -> None:
+    photo = torch.rand(24, 30, 3, generator=torch.Generator().manual_seed(0))
+    assert float(mapping.image_loss(photo, photo)) == pytest.approx(0, abs=1e-6)
+    only_color = replace(PAPER, omega=1.0)
+    assert float(mapping.image_loss(photo + 0.1, photo, only_color)) == pytest.approx(0.1, rel=1e-5)
+    assert 0 < float(mapping.image_loss(photo.flip(0), photo)) < 1
+    view = a_view()
+    truth = semantic_image(view, 2)
+    assert float(mapping.semantic_loss(truth, view, 2)) == pytest.approx(0, abs=1e-5)
+    assert float(mapping.semantic_loss(truth.flip(-1), view, 2)) > 0.3
+
+
+def test_the_three_conditions_of_growth() -> None:
+    view = a_view()
+    truth, seen = semantic_image(view, 2), torch.ones(36, 48)
+    same = Rendering(torch.cat([view.colors, truth], -1), view.depth, seen)
+    assert not mapping.needed(same, view).any()
+    hole = seen.clone()
+    hole[3, 4] = 0.5
+    assert mapping.holes(replace(same, silhouette=hole)).nonzero().tolist() == [[3, 4]]
+    behind = view.depth.clone()
+    behind[5, 6] += 0.5  # the map is farther than the proxy
+    behind[7, 8] -= 0.5  # and here nearer, which says nothing
+    assert mapping.nearer(replace(same, depth=behind), view).nonzero().tolist() == [[5, 6]]
+    other = same.features.clone()
+    other[9, 10, 3:] = truth[9, 10].flip(-1)
+    assert mapping.other_class(replace(same, features=other), view).nonzero().tolist() == [[9, 10]]
+    gaussians = a_map(view)
+    before = len(gaussians)
+    assert before == 36 * 48
+    assert len(mapping.grow(gaussians, view, torch.eye(4, dtype=torch.float64), 2)) - before < 0.2 * before
+
+
+def test_gradients_are_clipped_beside_boundaries_alone() -> None:
+    channels = torch.zeros(8, 8, dtype=torch.uint8)
+    channels[:, 4:] = 1
+    channels[0] = VOID
+    near = mapping.beside_boundary(channels)
+    assert near[2].tolist() == [False] * 3 + [True] * 2 + [False] * 3
+    image = torch.zeros(8, 8, 2, requires_grad=True)
+    shown = image * 1
+    mapping.clip_beside_boundary(shown, channels, 1.0)
+    weights = torch.ones(8, 8, 2)
+    weights[2, 3] = 100
+    weights[2, 0] = 100
+    (shown * weights).sum().backward()
+    assert image.grad is not None
+    assert image.grad[2, 0, 0] == 100
+    assert 1 < image.grad[2, 3, 0] < 20
+
+
+def test_mapping_lowers_its_loss() -> None:
+    view, pose = a_view(), torch.eye(4, dtype=torch.float64)
+    gaussians = a_map(view)
+    losses = [mapping.optimise(gaussians, view, pose, 2, 2.0) for _ in range(12)]
+    assert losses[-1] < losses[0]
+    mapping.prune(gaussians, 2.0)
+    assert 0 < len(gaussians) <= 36 * 48
+
+
+# (21) to (26) ---------------------------------------------------------------------------------------------------
+
+
+def looks(seed: int, classes: int) -> np.ndarray:
+    blocks = np.random.default_rng(seed).integers(0, classes, (6, 8)).astype(np.uint8)
+    return np.kron(blocks, np.ones((10, 10), np.uint8))
+
+
+def test_21_and_22_the_richest_tenth() -> None:
+    summaries = [summarise_labels(looks(k, 2), 6) for k in range(19)] + [summarise_labels(looks(99, 6), 6)]
+    s = loops.richness(summaries)
+    assert s.argmax() == 19
+    assert ((s > 0) & (s <= 1)).all()
+    assert 19 in loops.semantic_keyframes(summaries)
+    assert len(loops.semantic_keyframes(summaries)) <= 2
+    entropy = loops.richness(summaries, replace(PAPER, theta=1.0))
+    assert entropy[19] == 1
+
+
+def test_23_proposes_the_place_that_is_seen_again() -> None:
+    images = [looks(k, 3) for k in range(20)]
+    images[4] = images[19] = looks(77, 6)
+    summaries = [summarise_labels(labels, 6) for labels in images]
+    vectors = np.random.default_rng(0).normal(size=(20, 16))
+    vectors[19] = vectors[4]
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    assert loops.candidates(summaries, vectors) == [(4, 19)]
+    assert loops.candidates(summaries[:8], vectors[:8]) == []  # too near in time
+
+
+def test_24_weighs_three_likenesses() -> None:
+    one, two = summarise_labels(looks(1, 4), 4), summarise_labels(looks(2, 4), 4)
+    assert loops.similarity(one, [one], np.ones(1))[0] == pytest.approx(1)
+    alone = replace(PAPER, alpha1=0.0, alpha3=0.0)
+    assert loops.similarity(one, [one, two], np.array([0.5, -0.5]), alone).tolist() == [0.15, -0.15]
+    assert loops.similarity(one, [two], np.ones(1))[0] < 0.95
+
+
+def test_25_local_adjustment_has_its_minimum_at_the_pose() -> None:
+    view, pose = a_view(), torch.eye(4, dtype=torch.float64)
+    values = vars(a_map(view).map)
+    away = torch.tensor([0.02, 0, 0.0, 0, 0.0, 0])
+    here = adjustment.local_adjustment(view, values, pose, torch.zeros(6), 2, 2.0)
+    assert adjustment.local_adjustment(view, values, pose, away, 2, 2.0) > here
+    term = adjustment.pose_term(torch.tensor([0.2, 0, 0, 0, 0, 0.3]), 2.0)
+    assert float(term) == pytest.approx(0.01 + 0.09)
+
+
+def test_26_the_pose_graph_spreads_what_a_loop_says() -> None:
+    step = se3.exp(np.array([0.1, 0, 0, 0, 2 * np.pi / 12, 0]))
+    true = [np.linalg.matrix_power(step, k) for k in range(13)]
+    drift = se3.exp(np.array([0.004, 0.002, 0, 0, 0.01, 0]))
+    drifted = [np.eye(4)]
+    for _ in range(12):
+        drifted.append(drift @ step @ drifted[-1])
+    loop = LoopEdge(0, 12, true[12] @ np.linalg.inv(true[0]), 1.0, 100)
+    place = {k: k for k in range(13)}
+    moved, scales = adjustment.pose_graph(np.array(drifted), [loop], place, 1.0)
+    error = [np.linalg.norm(p - q) for p, q in zip(moved, true, strict=True)]
+    was = [np.linalg.norm(p - q) for p, q in zip(drifted, true, strict=True)]
+    assert 0 < max(error) < 0.6 * max(was)
+    assert np.allclose(scales, 1, atol=0.1)
+    unmoved, _ = adjustment.pose_graph(np.array(true), [loop], place, 1.0)
+    assert np.allclose(unmoved, true, atol=1e-6)
+
+
+def test_26_semantic_residual_is_zero_where_the_map_shows_the_labels() -> None:
+    view, pose = a_view(), torch.eye(4, dtype=torch.float64)
+    values = vars(a_map(view).map)
+    here = adjustment.semantic_residual(view, values, pose, 2)
+    wrong = replace(view, channels=1 - view.channels)
+    assert here < 0.2 * adjustment.semantic_residual(wrong, values, pose, 2)
+
+
+def test_26_poses_and_depths_are_adjusted_together() -> None:
+    """Three views of a wall, the depth of all too large by a smooth field, the last two poses off."""
+    camera = CAMERA.resized(96, 72)
+    x = np.linspace(-1, 1, 96, dtype=np.float32)
+    factor = torch.from_numpy(np.exp(0.05 * np.tile(x, (72, 1))).astype(np.float32))
+    views = [replace(v := a_view(k, 0.1 * k, camera), depth=v.depth * factor) for k in range(3)]
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses[:, 0, 3] = torch.tensor([0.0, -0.1, -0.2])
+    off = poses.clone()
+    off[1:] = se3.exp(torch.tensor([0.01, 0.006, 0, 0, 0.004, 0], dtype=torch.float64)) @ off[1:]
+    gaussians = a_map(views[0], off[0])
+    for view, pose in zip(views[1:], off[1:], strict=True):
+        mapping.grow(gaussians, view, pose, 2)
+
+    def parallax_error(pose: Tensor) -> float:
+        """Pixels by which the middle of the wall is off."""
+        shown = show(vars(gaussians.map), pose, views[2])
+        return float((shown.features[8:-8, 8:-8, :3] - views[2].colors[8:-8, 8:-8]).abs().mean())
+
+    before = parallax_error(off[2])
+    joint = adjustment.Adjustment.of(gaussians, [0, 1, 2], off, camera, 2.0)
+    assert torch.allclose(joint.means(torch.arange(len(gaussians)), joint.table.values), gaussians.map.means, atol=1e-4)
+    adjustment.adjust(joint, lambda k: views[k], 3, 2, 12, 0)
+    joint.settle()
+    new, fields = joint.moved(joint.table.values["twist"].detach()), joint.field
+    assert torch.allclose(new[0], off[0])
+    assert parallax_error(new[2]) < 0.7 * before
+    assert 0 < float(fields.abs().max()) < 0.3
+
+
+def test_seeds_have_unit_semantic_vectors() -> None:
+    view = a_view()
+    seeds = seed_gaussians(
+        view.depth > 0, view.depth, view.colors, view.channels, 1.0, 2, torch.eye(4).double(), CAMERA, 0
+    )
+    assert (seeds.class_logits.sum(1) / 3 == 1).all()
