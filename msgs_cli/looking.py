@@ -23,7 +23,7 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
     from .tables import scale_lines, status_table, warning_lines
 
     run = open_run(run_path)
-    found = run_status(run, all_stages())
+    found = run_status(run, all_stages)
     if as_json:
         click.echo(json.dumps(found.to_json(), indent=1))
         return

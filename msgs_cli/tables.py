@@ -99,7 +99,7 @@ def print_summary(root: Path, records: dict[str, Any]) -> None:
         say(line, err=True)
     for line in scale_lines(root, records):
         say(line)
-    if line := about_new_networks(RunFolder(root), all_stages()):
+    if line := about_new_networks(RunFolder(root), all_stages):
         say(f"\n{line}")
     if "export" in records:
         say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")

@@ -1,6 +1,6 @@
 """Every setting, its default and its meaning, once; `read_config` reads and writes them."""
 
-from dataclasses import Field, dataclass, field, fields, is_dataclass
+from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 STAGES = ("frames", "proxy", "tracking", "mapping", "global_ba", "export")
@@ -79,6 +79,15 @@ class RunConfig:
             "Kind of SOURCE: auto, images (a video or plain images, whatever is next to them), or a data set: "
             "7scenes, replica, tum, euroc, scannet, sens, nerfstudio, colmap, folder. Default: auto. A data set "
             "gives its times and camera, and with --depth files --semantics files its depth and labels.",
+        ),
+    )  # fmt: skip
+    method: str = setting(
+        "default", "paper: poses, map and loops by the equations of the paper, as printed; slower and less exact",
+        ("default", "paper"),
+        option=Option(
+            "method",
+            help="default, or paper: poses from the map alone, and the map, by the equations of the paper "
+            "MSGS-SLAM as printed, from each frame's own --depth and --semantics. Default: default.",
         ),
     )  # fmt: skip
     device: str = setting(
@@ -359,6 +368,14 @@ class Config:
     mapping: MappingConfig = field(default_factory=MappingConfig)
     global_ba: GlobalBaConfig = field(default_factory=GlobalBaConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
+
+
+def with_method(config: Config) -> Config:
+    """Return the settings as `run.method` needs them: the paper gives every frame its own proxies, unmixed with what
+    structure from motion knows."""
+    if config.run.method != "paper":
+        return config
+    return replace(config, proxy=replace(config.proxy, frames="all", fuse="never", moving="keep"))
 
 
 def allowed_values(known: Field[Any]) -> str:

@@ -9,7 +9,7 @@ from ..formats.atomic import own_temporaries, temporary_of, write_text
 from ..formats.errors import InputError, RecoverableError
 from ..formats.reading import require_listable, require_unicode
 from ..formats.video import probe_video
-from .config import SOURCE_LIST, STAGES, Config
+from .config import SOURCE_LIST, STAGES, Config, with_method
 from .engine.runner import run_stages
 from .engine.stages import Stage, TaskWorkers
 from .engine.tasks import BETWEEN_LOOKS, Shard, SharedWorkers, boards_in, set_threads
@@ -26,8 +26,8 @@ from .system.stopping import stop_if_asked
 from .system.wording import quoted
 
 
-def all_stages() -> list[Stage]:
-    """The stages in order. Imported here so that asking for help does not load torch."""
+def all_stages(method: str = "default") -> list[Stage]:
+    """The stages of a method (`run.method`) in order. Imported here so that asking for help does not load torch."""
     from .export.stage import STAGE as export
     from .frames.stage import STAGE as frames
     from .global_ba.stage import STAGE as global_ba
@@ -35,7 +35,10 @@ def all_stages() -> list[Stage]:
     from .proxy.stage import STAGE as proxy
     from .tracking.stage import STAGE as tracking
 
-    return [frames, proxy, tracking, mapping, global_ba, export]
+    between = [tracking, mapping, global_ba]
+    if method == "paper":
+        from .paper.stages import STAGES as between
+    return [frames, proxy, *between, export]
 
 
 def default_run_folder(source: Path) -> RunFolder:
@@ -100,7 +103,7 @@ def reconstruct(
     """
     require_unicode(source.resolve())  # the manifest names it
     require_unicode(run.root.absolute())
-    config = with_absolute_paths(config)
+    config = with_method(with_absolute_paths(config))
     digest = source_digest(source, config.run.format)
     _require_run_or_empty(run)
     resolve_device(config.run.device)  # refused before anything is written
@@ -126,7 +129,7 @@ def resume(
         )
     origin = load_source(run)
     source = Path(origin.path)
-    config = with_absolute_paths(config or load_settings(run))
+    config = with_method(with_absolute_paths(config or load_settings(run)))
     resolve_device(config.run.device)
     with locked(run):
         once_locked()
@@ -241,7 +244,8 @@ def _run(
     threads = config.run.threads or (workers.threads if workers else threads) or available_cpus()
     set_threads(threads)
     with NotedProgress(progress, run) as noted:
-        return run_stages(all_stages(), run, source, digest, config, noted, until, same_source, workers, threads, redo)
+        stages = all_stages(config.run.method)
+        return run_stages(stages, run, source, digest, config, noted, until, same_source, workers, threads, redo)
 
 
 def _require_run_or_empty(run: RunFolder) -> None:

@@ -1,6 +1,6 @@
 """Status of a run, for people and for programs."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,6 +26,9 @@ _BEYOND = 0.3
 """MB for each keyframe that `frames` or tracking has not in work."""
 DONE, RUNNING, DAMAGED, INTERRUPTED = "done", "running", "damaged", "interrupted"
 OUTDATED, NOT_YET = "outdated", "not yet"
+
+Program = Callable[[str], Sequence[Stage]]
+"""The stages of a method (`run.method`), in order."""
 
 
 @dataclass(frozen=True)
@@ -131,14 +134,14 @@ class RunStatus:
         }
 
 
-def run_status(run: RunFolder, program: Sequence[Stage] = ()) -> RunStatus:
+def run_status(run: RunFolder, program: Program = lambda method: ()) -> RunStatus:
     """Reads every file of the run once, to find damaged ones; with the stages of the `program`, reports too what it
     would make again, and why.
 
     Raises InputError where the manifest or the settings are damaged.
     """
     records, config = load_records(run), load_settings(run)
-    again, newer = _compared(run, program, records, config)
+    again, newer = _compared(run, program(config.run.method), records, config)
     running = load_running(run)
     stages = []
     for name in STAGES:
@@ -188,11 +191,11 @@ def networks_chosen(inputs: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(card.model.stem for name in inputs for card in cards[name] if card is not None))
 
 
-def about_new_networks(run: RunFolder, program: Sequence[Stage]) -> str:
+def about_new_networks(run: RunFolder, program: Program) -> str:
     """Say which networks have been installed since the run's stages were made, and how to use them; "" without any."""
     records, config, source = load_records(run), load_settings(run), Path(load_source(run).path)
     added: dict[str, tuple[str, ...]] = {}
-    for stage in program:
+    for stage in program(config.run.method):
         if (record := records.get(stage.name)) is None or not stage.auto(config):
             continue
         with suppress(InputError):  # files are gone, of which the run itself tells

@@ -1,0 +1,280 @@
+"""The paper's method as stages of a run: its frames and proxies come from the stages before, the export follows.
+
+`tracking` is figure 1 frame by frame, `mapping` visits all keyframes once more, `global_ba` closes loops and adjusts.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...formats.errors import InputError
+from ...formats.tensors import load_tensors, save_tensors
+from ..compute.adam import AdamTable
+from ..depth.fields import DepthFields
+from ..engine.stages import Stage, StageContext
+from ..geometry.se3 import Similarity
+from ..global_ba.candidates import summarise_labels
+from ..mapping.measure import ViewFigures, mean_figures, measure_view
+from ..mapping.move_map import follow_keyframes, move_map
+from ..render.gaussian_map import GaussianMap
+from ..run.files import (
+    CALIBRATION,
+    CLASSES,
+    DEPTH_FIELDS,
+    DESCRIPTORS,
+    EXPOSURE,
+    FIGURES,
+    LOOPS,
+    MAP,
+    SPARSE,
+    TRAJECTORY,
+)
+from ..system.stopping import is_asked
+from ..system.wording import stretches
+from ..types import LoopEdge, Trajectory
+from .adjustment import Adjustment, adjust, pose_graph
+from .gaussians import Gaussians
+from .loops import candidates, close, small_looks
+from .mapping import optimise
+from .recording import Recording, constants_of, sparse_model, trajectory_of
+from .slam import Slam
+
+SNAPSHOT_EVERY = 5
+"""Frames between two snapshots."""
+MAP_PASSES, JOINT_PASSES, FINE_PASSES = 1, 6, 4
+"""Visits of each keyframe: in `mapping`; of poses, depths and map together; and of the map alone at full size."""
+
+
+def track(context: StageContext) -> dict[str, Any]:
+    """Poses of all frames, and the map that they were found with."""
+    _warn(context)
+    recording, snapshot = Recording(context), context.snapshot / "slam.safetensors"
+    slam, done = Slam(len(recording.class_ids), context.config.run.seed), 0
+    if snapshot.exists():
+        held = load_tensors(snapshot)
+        done = int(held["done"])
+        slam.restore(held)
+    constants, frames = constants_of(context.config), recording.frames
+    for frame in context.progress.track(frames[done:], "tracking", len(frames) - done):
+        slam.step(recording.views[frame.id], recording.views.__getitem__, frame.id not in recording.held, constants)
+        done += 1
+        if slam.gaussians is not None and (done % SNAPSHOT_EVERY == 0 or is_asked()):
+            save_tensors(snapshot, {**slam.to_tensors(), "done": torch.tensor(done)})
+    if slam.gaussians is None or len(slam.poses) < 2:
+        raise InputError(
+            f"{context.source}: none of {len(frames)} frames could be tracked by the map. --method paper needs a depth "
+            "for its first frames: give --depth files:FOLDER or a network's name"
+        )
+    trajectory = trajectory_of(frames, slam.poses, slam.keyframes, slam.lost)
+    TRAJECTORY.save(context.folder, trajectory)
+    MAP.save(context.folder, slam.gaussians.map)
+    SPARSE.save(context.folder, sparse_model(slam.gaussians.map, trajectory, recording.full))
+    DEPTH_FIELDS.save(context.folder, DepthFields(slam.fields))
+    if slam.lost:
+        context.warn(f"{len(slam.lost)} frames have no pose: {stretches(slam.lost)}")
+    metric = bool(context.run.load(FIGURES["proxy"]).get("metric", False))
+    figures = {
+        "frames": len(frames), "posed": len(slam.poses), "keyframes": len(slam.fields), "by_rotation": 0,
+        "lost": {str(i): reason for i, reason in slam.lost.items()}, "scale": "metric" if metric else "free",
+        "scale_relative_sd": None, "method": "paper", "gaussians": len(slam.gaussians), "pieces": [],
+    }  # fmt: skip
+    FIGURES["tracking"].save(context.folder, figures)
+    return figures
+
+
+def _warn(context: StageContext) -> None:
+    """Say in what this run departs from the paper."""
+    proxy, camera = context.run.load(FIGURES["proxy"]), context.run.load(CALIBRATION)
+    if not proxy.get("metric", False):
+        context.warn(
+            f"--method paper: proxy depth is by {proxy['depth']}, which knows keyframes of structure from motion alone "
+            "and no metres, not the metric network of the paper"
+        )
+    if camera.origin == "self-calibrated":
+        context.warn("--method paper: the camera was unknown, and is that of structure from motion")
+    if camera.directions > 1:
+        raise InputError("--method paper tracks one perspective camera: it cannot be used with panoramas")
+
+
+def map_keyframes(context: StageContext) -> dict[str, Any]:
+    """Every keyframe visited once more, eq. (18)."""
+    recording, run = Recording(context), context.run
+    trajectory, fields = run.load(TRAJECTORY, "tracking"), run.load(DEPTH_FIELDS, "tracking")
+    gaussians = Gaussians.of(run.load(MAP, "tracking"))
+    _visit(context, recording, gaussians, trajectory, fields, MAP_PASSES, "mapping")
+    MAP.save(context.folder, gaussians.map)
+    TRAJECTORY.save(context.folder, trajectory)
+    _save_exposure(context, trajectory)
+    figures = {
+        "keyframes": int(trajectory.is_keyframe.sum()), "gaussians": len(gaussians), "submaps": 1,
+        "iterations": MAP_PASSES * int(trajectory.is_keyframe.sum()), "classes": len(recording.class_ids),
+        **_measure(recording, gaussians.map, trajectory, fields),
+    }  # fmt: skip
+    FIGURES["mapping"].save(context.folder, {**figures, "class_ids": list(recording.class_ids), "submaps": []})
+    return figures
+
+
+def _visit(
+    context: StageContext, recording: Recording, gaussians: Gaussians, trajectory: Trajectory, fields: DepthFields,
+    passes: int, label: str, begin: int = 0, after: Callable[[int], None] = lambda done: None,
+) -> None:  # fmt: skip
+    """Adam on (18), keyframe by keyframe in random order, its rate falling; `after` each pass."""
+    ids, seed = trajectory.frame_ids[trajectory.is_keyframe].tolist(), context.config.run.seed
+    poses = dict(zip(trajectory.frame_ids.tolist(), trajectory.cam_from_world, strict=True))
+    unit, constants = scene_depth(recording, ids, fields), constants_of(context.config)
+    for number in range(begin, passes):
+        order = np.random.default_rng([seed, number, 2]).permutation(ids).tolist()
+        for k, i in enumerate(context.progress.track(order, label, len(order))):
+            rate = 0.1 ** ((number * len(ids) + k) / (passes * len(ids)))
+            view, pose = recording.scaled(i, fields), torch.from_numpy(poses[i])
+            optimise(gaussians, view, pose, len(recording.class_ids), unit, rate, constants)
+        after(number + 1)
+
+
+def scene_depth(recording: Recording, ids: list[int], fields: DepthFields) -> float:
+    """Find the median depth of the first keyframe, the unit of all depth terms."""
+    depth = recording.scaled(ids[0], fields).depth
+    return float(depth[depth > 0].median())
+
+
+def _measure(
+    recording: Recording, gaussian_map: GaussianMap, trajectory: Trajectory, fields: DepthFields
+) -> dict[str, float]:
+    found: dict[str, list[ViewFigures]] = {"keyframe": [], "held_out": []}
+    keys = set(trajectory.frame_ids[trajectory.is_keyframe].tolist())
+    nothing = np.zeros(3, np.float32)
+    for i, pose in zip(trajectory.frame_ids.tolist(), trajectory.cam_from_world, strict=True):
+        if i in keys:
+            view = recording.scaled(i, fields)
+            found["keyframe"].append(measure_view(gaussian_map, view, pose, nothing, nothing))
+        elif i in recording.held:
+            found["held_out"].append(measure_view(gaussian_map, recording.views[i], pose, nothing, nothing))
+    return mean_figures(found["keyframe"], "keyframe") | mean_figures(found["held_out"], "held_out")
+
+
+def _save_exposure(context: StageContext, trajectory: Trajectory) -> None:
+    """The paper has no exposures: none is changed."""
+    ids = trajectory.frame_ids[trajectory.is_keyframe]
+    nothing = np.zeros((len(ids), 3), np.float32)
+    EXPOSURE.save(context.folder, {"frame_ids": ids, "log_gains": nothing, "offsets": nothing})
+
+
+def close_and_adjust(context: StageContext) -> dict[str, Any]:
+    """Loops (21) to (24), then poses, depths and map together (26), then the map at full size."""
+    recording, run = Recording(context), context.run
+    trajectory, fields = run.load(TRAJECTORY, "mapping"), run.load(DEPTH_FIELDS, "tracking")
+    gaussian_map = run.load(MAP, "mapping")
+    tried, loops = _loops(context, recording, trajectory, fields, gaussian_map)
+    if loops:
+        trajectory, gaussian_map = _closed(recording, trajectory, fields, gaussian_map, loops)
+    gaussians, trajectory, fields = _adjusted(context, recording, trajectory, fields, gaussian_map)
+    TRAJECTORY.save(context.folder, trajectory)
+    SPARSE.save(context.folder, sparse_model(gaussians.map, trajectory, recording.full))
+    MAP.save(context.folder, gaussians.map)
+    _save_exposure(context, trajectory)
+    LOOPS.save(context.folder, loops)
+    DEPTH_FIELDS.save(context.folder, fields)
+    figures = {
+        "candidates": tried, "verified": len(loops), "implausible": 0, "unsupported": 0, "loops": len(loops),
+        "joint": "kept", **_measure(recording, gaussians.map, trajectory, fields),
+    }  # fmt: skip
+    FIGURES["global_ba"].save(context.folder, figures)
+    return figures
+
+
+def _loops(
+    context: StageContext, recording: Recording, trajectory: Trajectory, fields: DepthFields, gaussian_map: GaussianMap
+) -> tuple[int, list[LoopEdge]]:
+    """Return how many candidates there are, and the loops among them; kept in a snapshot."""
+    if not context.config.global_ba.use_loops:
+        return 0, []
+    kept = LOOPS.find(context.snapshot)
+    ids = trajectory.frame_ids[trajectory.is_keyframe].tolist()
+    classes = len(context.run.load(CLASSES))
+    maps = {i: context.run.find_proxy(i) for i in ids}
+    summaries = [summarise_labels(m.labels, classes) for m in maps.values() if m is not None]
+    learned = context.run.find(DESCRIPTORS) or {}
+    known = all(i in learned for i in ids)
+    looks: NDArray = np.stack([learned[i] for i in ids]) if known else small_looks([recording.views[i] for i in ids])
+    pairs = candidates(summaries, looks, constants_of(context.config)) if context.config.global_ba.use_semantics else []
+    if kept is not None:
+        return len(pairs), kept
+    poses = trajectory.cam_from_world[trajectory.is_keyframe]
+    unit, seed = scene_depth(recording, ids, fields), context.config.run.seed
+    found = close(
+        context.progress.track(pairs, "loops", len(pairs)), ids, poses, lambda n: recording.scaled(ids[n], fields),
+        Gaussians.of(gaussian_map), len(recording.class_ids), unit, seed,
+    )  # fmt: skip
+    LOOPS.save(context.snapshot, found)
+    return len(pairs), found
+
+
+def _closed(
+    recording: Recording, trajectory: Trajectory, fields: DepthFields, gaussian_map: GaussianMap, loops: list[LoopEdge]
+) -> tuple[Trajectory, GaussianMap]:
+    """Spread the drift that loops show; Gaussians and frames move with their keyframes."""
+    ids, old = trajectory.frame_ids[trajectory.is_keyframe], trajectory.cam_from_world[trajectory.is_keyframe]
+    place = {frame_id: n for n, frame_id in enumerate(ids.tolist())}
+    new, _ = pose_graph(old, loops, place, scene_depth(recording, ids.tolist(), fields))
+    return _following(trajectory, new), move_map(gaussian_map, ids, old, new, np.ones(len(ids)))
+
+
+def _following(trajectory: Trajectory, new: NDArray[np.float64]) -> Trajectory:
+    """All frames after their keyframes moved to new poses (N, 4, 4)."""
+    ids, old = trajectory.frame_ids[trajectory.is_keyframe], trajectory.cam_from_world[trajectory.is_keyframe]
+    poses = follow_keyframes(trajectory.frame_ids, trajectory.cam_from_world, ids, old, new, np.ones(len(ids)))
+    poses[trajectory.is_keyframe] = new
+    poses[~trajectory.is_posed] = np.eye(4)
+    return replace(trajectory, cam_from_world=poses)
+
+
+def _adjusted(
+    context: StageContext, recording: Recording, trajectory: Trajectory, fields: DepthFields, gaussian_map: GaussianMap
+) -> tuple[Gaussians, Trajectory, DepthFields]:
+    """(26) at the working size, the world brought back to the proxies' scale, then (18) at full size; goes on from the
+    last pass."""
+    snapshot, seed, classes = context.snapshot / "joint.safetensors", context.config.run.seed, len(recording.class_ids)
+    ids = trajectory.frame_ids[trajectory.is_keyframe].tolist()
+    poses = torch.from_numpy(trajectory.cam_from_world[trajectory.is_keyframe])
+    gaussians = Gaussians.of(gaussian_map)
+    joint = Adjustment.of(gaussians, ids, poses, recording.camera, scene_depth(recording, ids, fields))
+    done = 0
+    if snapshot.exists():
+        held = load_tensors(snapshot)
+        done, joint.table = int(held["done"]), AdamTable.from_tensors(held, "joint", ("twist", "field"))
+        joint.gaussians = gaussians = Gaussians.from_tensors(held)
+
+    def save(passes: int) -> None:
+        state = {**gaussians.to_tensors(), **joint.table.to_tensors("joint"), "done": torch.tensor(passes)}
+        save_tensors(snapshot, state)
+
+    adjust(
+        joint, lambda n: recording.scaled(ids[n], fields), len(ids), classes, JOINT_PASSES, seed, done, save,
+        lambda order: context.progress.track(order, "adjusting", len(order)), constants_of(context.config),
+    )  # fmt: skip
+    own = np.stack([fields.of_frame[i] for i in ids]) + joint.field.numpy()
+    shrunk = -float(own.mean())  # the proxies' scale is right on the whole
+    trajectory = _following(trajectory, joint.moved(joint.table.values["twist"].detach()).numpy())
+    resized = Similarity(math.exp(shrunk), np.eye(3), np.zeros(3)).apply_to_poses(trajectory.cam_from_world)
+    resized[~trajectory.is_posed] = np.eye(4)
+    trajectory, fields = (
+        replace(trajectory, cam_from_world=resized),
+        DepthFields(dict(zip(ids, own + shrunk, strict=True))),
+    )
+    if done <= JOINT_PASSES:
+        joint.settle()
+        gaussians.resize(shrunk)
+    fine = Recording(context, context.config.mapping.max_side)
+    begin = max(done - JOINT_PASSES, 0)
+    _visit(
+        context, fine, gaussians, trajectory, fields, FINE_PASSES, "mapping", begin, lambda n: save(JOINT_PASSES + n)
+    )
+    return gaussians, trajectory, fields
+
+
+STAGES = [Stage("tracking", track), Stage("mapping", map_keyframes), Stage("global_ba", close_and_adjust)]

@@ -1,0 +1,138 @@
+"""The paper's method as stages of a run: poses from the map alone, stopped and gone on with, and the switch."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from finished import note_finished
+
+from msgs_slam.pipelines.config import Config, ProxyConfig, RunConfig, with_method
+from msgs_slam.pipelines.engine.stages import StageContext
+from msgs_slam.pipelines.geometry.se3 import align_points
+from msgs_slam.pipelines.paper import stages
+from msgs_slam.pipelines.paper.stages import STAGES
+from msgs_slam.pipelines.reconstruct import all_stages
+from msgs_slam.pipelines.run.files import CLASS_IDS, DEPTH_FIELDS, MAP, SPARSE, TRAJECTORY
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.system.progress import SilentProgress
+from tests.pipelines.mapping.small_run import make_run
+
+CONFIG = Config(run=RunConfig(method="paper", threads=1))
+FRAMES = 8
+
+
+class Interrupted(Exception):
+    pass
+
+
+class StoppingProgress(SilentProgress):
+    """Ends the work after so many items of a label."""
+
+    def __init__(self, label: str, after: int) -> None:
+        self.label, self.left = label, after
+
+    def track(self, items: Iterable, label: str, total: int | None = None) -> Iterator:
+        for item in items:
+            if label == self.label:
+                if self.left == 0:
+                    raise Interrupted
+                self.left -= 1
+            yield item
+
+
+def prepared(root: Path, sequence: Path) -> RunFolder:
+    run = make_run(root, sequence, every=1, most=FRAMES)
+    note_finished(run, ("frames", "proxy"), CONFIG)
+    return run
+
+
+def go(run: RunFolder, number: int, progress: SilentProgress | None = None) -> dict:
+    """Run one of the three stages, as far as the progress lets it."""
+    stage = STAGES[number]
+    folder = run.stage(stage.name)
+    folder.mkdir(exist_ok=True)
+    figures = stage.run(StageContext(run, run.root, CONFIG, folder, progress or SilentProgress()))
+    for left in sorted((folder / "snapshot").glob("*")):
+        left.unlink()
+    note_finished(run, ("frames", "proxy", *(s.name for s in STAGES[: number + 1])), CONFIG)
+    return figures
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, world_sequence: Path) -> RunFolder:
+    run = prepared(tmp_path_factory.mktemp("paper") / "whole.msgs", world_sequence)
+    for number in range(3):
+        go(run, number)
+    return run
+
+
+def test_poses_and_map_come_from_rendering_alone(whole: RunFolder, world_sequence: Path) -> None:
+    trajectory = whole.load(TRAJECTORY, "global_ba")
+    assert trajectory.is_posed.all()
+    true = np.loadtxt(world_sequence / "traj.txt").reshape(-1, 4, 4)[:FRAMES, :3, 3]
+    error = np.linalg.norm(align_points(trajectory.centers, true, False).apply(trajectory.centers) - true, axis=1)
+    length = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
+    assert 0 < np.sqrt((error**2).mean()) < 0.05 * length
+    figures = {s.name: (whole.stage(s.name) / f"{s.name}.json") for s in STAGES}
+    assert all(path.is_file() for path in figures.values())
+    gaussian_map = whole.load(MAP, "global_ba")
+    assert len(gaussian_map) > 80 * 60
+    assert gaussian_map.class_logits.shape[1] == len(whole.load(CLASS_IDS))
+    assert set(whole.load(DEPTH_FIELDS, "global_ba").of_frame) == set(trajectory.frame_ids[trajectory.is_keyframe])
+    assert len(whole.load(SPARSE, "global_ba").points_in_world) > 100
+
+
+@pytest.mark.parametrize(("number", "label", "after"), [(0, "tracking", 6), (2, "adjusting", 9), (2, "mapping", 9)])
+def test_stopped_and_gone_on_with_it_ends_with_the_same_bytes(
+    whole: RunFolder, world_sequence: Path, tmp_path: Path, number: int, label: str, after: int
+) -> None:
+    run = prepared(tmp_path / "stopped.msgs", world_sequence)
+    for before in range(number):  # as the whole run left it
+        for path in whole.stage(STAGES[before].name).rglob("*"):
+            if path.is_file():
+                copy = run.stage(STAGES[before].name) / path.relative_to(whole.stage(STAGES[before].name))
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                copy.write_bytes(path.read_bytes())
+    note_finished(run, ("frames", "proxy", *(s.name for s in STAGES[:number])), CONFIG)
+    with pytest.raises(Interrupted):
+        go(run, number, StoppingProgress(label, after))
+    snapshots = list((run.stage(STAGES[number].name) / "snapshot").iterdir())
+    assert snapshots
+    go(run, number)
+    for name in ("trajectory.npz", "map.safetensors"):
+        stage = STAGES[number].name
+        assert (run.stage(stage) / name).read_bytes() == (whole.stage(stage) / name).read_bytes()
+
+
+def test_a_loop_that_is_measured_moves_everything(whole: RunFolder) -> None:
+    """The last keyframe is said to be where the graph has it: nothing moves; a hand's breadth away: it follows."""
+    trajectory = whole.load(TRAJECTORY, "mapping")
+    ids = trajectory.frame_ids[trajectory.is_keyframe].tolist()
+    context = StageContext(whole, whole.root, CONFIG, whole.stage("global_ba"), SilentProgress())
+    recording, fields = stages.Recording(context), whole.load(DEPTH_FIELDS, "tracking")
+    gaussian_map = whole.load(MAP, "mapping")
+    first, last = (trajectory.cam_from_world[i] for i in (ids[0], ids[-1]))
+    motion = last @ np.linalg.inv(first)
+    edge = stages.LoopEdge(ids[0], ids[-1], motion, 1.0, 100)
+    same, _ = stages._closed(recording, trajectory, fields, gaussian_map, [edge])
+    assert np.allclose(same.cam_from_world, trajectory.cam_from_world, atol=1e-6)
+    away = motion.copy()
+    away[0, 3] += 0.1
+    moved, moved_map = stages._closed(
+        recording, trajectory, fields, gaussian_map, [replace(edge, frame2_from_frame1=away)]
+    )
+    shift = np.linalg.norm(moved.centers - trajectory.centers, axis=1)
+    assert shift[ids[0]] < 1e-9
+    assert 0.01 < shift[ids[-1]] < 0.1
+    assert not np.allclose(moved_map.means, gaussian_map.means)
+
+
+def test_the_switch_changes_three_stages_and_what_proxies_are() -> None:
+    default, chosen = all_stages(), all_stages("paper")
+    assert [s.name for s in default] == [s.name for s in chosen]
+    assert [s.file.parent.name for s in chosen] == ["frames", "proxy", "paper", "paper", "paper", "export"]
+    assert with_method(Config()) == Config()
+    assert with_method(CONFIG).proxy == ProxyConfig(frames="all", fuse="never", moving="keep")
+    assert with_method(with_method(CONFIG)) == with_method(CONFIG)
