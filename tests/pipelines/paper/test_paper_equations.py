@@ -1,5 +1,6 @@
 """Every numbered equation of the paper: hand-made cases, limits and finite differences; and that none is missing."""
 
+import ast
 import math
 import re
 from dataclasses import replace
@@ -40,12 +41,26 @@ def a_map(view: View, pose: Tensor | None = None) -> Gaussians:
     return mapping.grow(None, view, torch.eye(4, dtype=torch.float64) if pose is None else pose, 2)
 
 
+def named_by_equation() -> dict[int, set[str]]:
+    """module.function of all whose docstrings begin with an equation, or a term of one."""
+    found: dict[int, set[str]] = {}
+    for path in Path(paper.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                text = ast.get_docstring(node) or ""
+                if match := re.match(r"(?:First term of |Second term of )?Eq\. \((\d+)\)", text):
+                    found.setdefault(int(match[1]), set()).add(f"{path.stem}.{node.name}")
+    return found
+
+
 def test_every_equation_has_a_function_that_names_it() -> None:
-    texts = [p.read_text(encoding="utf-8") for p in Path(paper.__file__).parent.glob("*.py")]
-    named = {
-        int(n) for text in texts for n in re.findall(r'"""(?:\w+ )*(?:term|condition)?(?: of )?Eqs?\. \((\d+)\)', text)
-    }
-    assert named == set(range(1, 27))
+    assert set(named_by_equation()) == set(range(1, 27))
+
+
+def test_the_table_of_the_method_page_is_that_of_the_code() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "method.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| \((\d+)\) \| ([^|]+) \|", page, re.MULTILINE)
+    assert {int(n): set(re.findall(r"`(\w+\.\w+)`", cell)) for n, cell in rows} == named_by_equation()
 
 
 # (1) to (3) -----------------------------------------------------------------------------------------------------

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from finished import note_finished
 
+from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.config import Config, ProxyConfig, RunConfig, with_method
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.se3 import align_points
@@ -21,6 +23,17 @@ from tests.pipelines.mapping.small_run import make_run
 
 CONFIG = Config(run=RunConfig(method="paper", threads=1))
 FRAMES = 8
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """As a run of these settings has it; threads of a few small images wait for each other longer than they work."""
+    before = get_threads(), torch.get_num_threads()
+    set_threads(1)
+    torch.set_num_threads(1)
+    yield
+    set_threads(before[0])
+    torch.set_num_threads(before[1])
 
 
 class Interrupted(Exception):
