@@ -1,4 +1,4 @@
-"""What a run holds for the paper's method: the frames as views with the proxies as they were given, and its results."""
+"""Frames of a run as views with the proxies as they were given, and the results of the paper's method in its files."""
 
 from __future__ import annotations
 

@@ -55,11 +55,11 @@ class Slam:
         """One frame of figure 1; `view_of` a keyframe, by its id, `may_map`: not for a frame that only measures."""
         if self.gaussians is None:
             if may_map and bool((view.depth > 0).any()):
-                self._begin(view)
+                self._begin(view, constants)
                 self._optimise(view_of, FIRST_STEPS, [view.frame_id], constants)
             return
-        starts = self._starts()
-        found = track(self.gaussians, self._scaled(view), starts, self.classes, self.unit, self.seed + view.frame_id)
+        seed = self.seed + view.frame_id
+        found = track(self.gaussians, self._scaled(view), self._starts(), self.classes, self.unit, seed, constants)
         if found.covered < _COVERED:
             self.lost[view.frame_id] = "the map covers too little of it"
             return
@@ -77,12 +77,12 @@ class Slam:
         if len(self.fields) % PRUNE_EVERY == 0:
             prune(self.gaussians, self.unit)
 
-    def _begin(self, view: View) -> None:
+    def _begin(self, view: View, constants: Constants) -> None:
         """First pose = identity; the scale is that of the proxy depth."""
         self.unit = float(view.depth[view.depth > 0].median())
         self.poses[view.frame_id] = torch.eye(4, dtype=torch.float64)
         self.fields[view.frame_id], self.looks[view.frame_id] = np.zeros((FINE.rows, FINE.columns)), _looks(view)
-        self.gaussians = grow(None, view, self.poses[view.frame_id], self.classes)
+        self.gaussians = grow(None, view, self.poses[view.frame_id], self.classes, constants)
 
     def _starts(self) -> list[Tensor]:
         """By (15), and where the last frame was: of sudden turns that is nearer."""

@@ -147,7 +147,7 @@ def _bring_up_to_date(source: Path, job: Job, first: Job, progress: Progress) ->
     if job.variant != COMPLETE:
         branch(job.base, job.run, (*_SHARED, "tracking", "mapping", _LAST))
     elif job.run != first.run:
-        branch(first.run, job.run, _SHARED, (all_stages(), job.config))
+        branch(first.run, job.run, _SHARED, (all_stages(job.config.run.method), job.config))
     reconstruct(source, job.run, job.config, progress, until=_LAST)
 
 

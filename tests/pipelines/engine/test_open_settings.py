@@ -38,7 +38,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
         found.append((context.device, context.threads))
         return {}
 
-    monkeypatch.setattr(reconstruct, "all_stages", lambda: [Stage(name, run) for name in STAGES])
+    monkeypatch.setattr(reconstruct, "all_stages", lambda method: [Stage(name, run) for name in STAGES])
     return found
 
 

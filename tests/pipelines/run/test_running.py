@@ -51,7 +51,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> States:
 
     monkeypatch.setattr(ending, "_flush_folder", flush)
     monkeypatch.setattr(running, "_BETWEEN_WRITES", 0.0)
-    monkeypatch.setattr(reconstruct, "all_stages", lambda: [Stage(name, run) for name in STAGES])
+    monkeypatch.setattr(reconstruct, "all_stages", lambda method: [Stage(name, run) for name in STAGES])
     return found
 
 
