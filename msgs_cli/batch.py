@@ -141,7 +141,7 @@ def _print(rows: list[dict[str, object]]) -> None:
 @UNTIL
 @verbosity_options
 def work(run_path: Path, shard: str, placed: bool, until: str, output: Output) -> None:
-    """Work on RUN beside other processes that do the same, on this machine or others that see the folder.
+    """Process RUN together with other workers, on this machine or others that see the folder.
 
     Begin the run with `msgs-slam reconstruct SOURCE --out RUN --until frames`, with all settings, run.threads among
     them. Then any number of processes, in any order and at any time, bring it to its end together, each its own share

@@ -44,14 +44,14 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
     "--truth", required=True, type=click.Path(path_type=Path, exists=True), metavar="PATH",
     help="A data set with true poses and, if it has them, depth and labels.",
 )  # fmt: skip
-@click.option("--format", "truth_format", default="auto", help="Layout of the truth; auto recognises it.")
+@click.option("--format", "truth_format", default="auto", help="Layout of the ground truth; auto recognises it.")
 @click.option(
     "--class-map", metavar="FILE|NAME",
-    help="A TOML of the run's classes to the truth's. Default: one that comes with the program, where it fits.",
+    help="A TOML from the run's classes to those of the ground truth. Default: a built-in one that fits.",
 )  # fmt: skip
 @verbosity_options
 def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | None, output: Output) -> None:
-    """Compare RUN with the truth: poses, images, depth, labels, mesh. Writes RUN/evaluation/."""
+    """Compare RUN with ground truth: poses, images, depth, labels, mesh. Writes RUN/evaluation/."""
     from ..formats.datasets import open_sequence
     from ..pipelines.evaluation.labels import open_class_map
     from ..pipelines.evaluation.write import evaluation_table, write_evaluation
@@ -61,7 +61,7 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | No
     sequence = open_sequence(truth, truth_format)
     with on_sigterm(signal.SIG_DFL):
         figures = write_evaluation(run, sequence, output.progress(), class_map=joins)
-    say(evaluation_table(figures))
+    say(evaluation_table(figures, with_protocol=False))
     output.tell_result(evaluation=run.evaluation_file.parent)
 
 
@@ -70,7 +70,7 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | No
 @click.option(
     "--to", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Default: report.html in the run."
 )
-@click.option("--pdf", is_flag=True, help="Print it beside as a PDF, too; needs Chromium or Chrome.")
+@click.option("--pdf", is_flag=True, help="Also write a PDF; needs Chromium or Chrome.")
 @verbosity_options
 def report(run_path: Path, to: Path | None, pdf: bool, output: Output) -> None:
     """Write one HTML file that says what was found, how good it is, and what to film better."""

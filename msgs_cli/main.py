@@ -242,7 +242,7 @@ def export(
     overrides: tuple[str, ...],
     output: Output,
 ) -> None:
-    """Write the files for other programs: COLMAP model, Gaussian PLY, SPZ, SOG or GLB, labelled mesh, textured mesh,
+    """Export to other formats: COLMAP model, Gaussian PLY, SPZ, SOG or GLB, labelled mesh, textured mesh,
     TUM trajectory; `--only html`: one web page that shows the map, to send to somebody; `--only tiles`: 3D Tiles for
     CesiumJS; `--only obj`: the textured mesh as OBJ; `--only collision`: a light mesh to walk in; `--only usd`: the
     mesh as USDZ; `--only floorplan`: the walls from above with their lengths.
@@ -275,7 +275,7 @@ def export(
     default=Path("msgs-demo"),
     metavar="DIR",
     show_default=True,
-    help="Where the clip, its truth and the run are written.",
+    help="Where the clip, its ground truth and the run are written.",
 )
 @settings_options
 @device_option
@@ -349,10 +349,10 @@ if __name__ == "__main__":
 def extend(run_path: Path, videos: tuple[Path, ...], output: Output) -> None:
     """Add VIDEO, by the same camera and of the same place, to the finished RUN.
 
-    First a few images of it are looked for in the run: where nothing is recognised, or the camera is another one, that
-    is said and nothing is changed. Then its frames join those of the run, whose poses are the start, all are adjusted
-    together, and the map is grown where the added frames look. Coordinates stay what they were, as near as the
-    adjustment allows. Stopped, the same command or `msgs-slam resume RUN` goes on.
+    First a few of its images are searched for in the run: if nothing matches or the camera differs, it stops and
+    changes nothing. Then its frames join those of the run, whose poses are the start, all are adjusted together, and
+    the map is grown where the added frames look. Coordinates stay what they were, as near as the adjustment allows.
+    Stopped, the same command or `msgs-slam resume RUN` goes on.
     """
     from ..pipelines.reconstruct import extend as extend_run
     from ..pipelines.run.folder import RunFolder

@@ -11,6 +11,7 @@ import click
 
 from ..pipelines.system.wording import BAD, Finding
 from .output import say
+from .tables import format_table, terminal_width
 
 if TYPE_CHECKING:
     from ..pipelines.networks.registry import Model, ModelStore
@@ -27,12 +28,12 @@ def _size(model: Model) -> str:
 
 @models.command("list")
 def list_models() -> None:
-    """Every known model: whether it is here, its size and its licence."""
+    """List the known models: whether each is here, its size and its licence."""
     from ..pipelines.networks.registry import ModelStore
 
-    store = ModelStore.open()
+    store, rows = ModelStore.open(), []
     for model in store.models:
-        here = "here" if store.is_here(model) else "-"
+        here = store.is_here(model)
         notes = ["commercial use allowed" if model.commercial else "ask before commercial use"]
         if model.pull:
             notes.append("comes with `models pull`" if model.pull == "default" else "comes with `models pull --best`")
@@ -42,7 +43,10 @@ def list_models() -> None:
             notes.append("no fixed revision: refused if its makers replace it")
         family = store.families[model.family]
         use = "metres" if family.get("metres_only") else family["task"]
-        click.echo(f"{model.name:18} {use:13} {here:5} {_size(model):>12}  {model.licence} ({'; '.join(notes)})")
+        if here or model.urls:  # of the others there is nothing to pull
+            about = f"{model.licence} ({'; '.join(notes)})"
+            rows.append((model.name, use, "here" if here else "-", _size(model), about))
+    click.echo(format_table(("model", "for", "", "size", "licence"), rows, terminal_width()))
     click.echo(f"cache: {store.cache}")
 
 
@@ -173,7 +177,7 @@ def path(name: str) -> None:
 
 @click.command()
 def doctor() -> None:
-    """Say what this machine has for the program, a line each, with the fix where something is missing.
+    """Check this machine and suggest fixes.
 
     Exit code 1 where something would keep a reconstruction from running.
     """

@@ -61,7 +61,7 @@ def status_table(stages: Sequence[StageStatus], everything: bool = False) -> str
             [stage.name, stage.state, f"{record.seconds:.1f}", f"{record.peak_memory_mb:.0f}", expected, figures]
         )
     header = ["stage", "state", "seconds", "peak MB", "expected MB", "figures"]
-    shown = [n for n in range(len(header)) if n != 4 or any(row[n] for row in rows)]
+    shown = [n for n in range(len(header)) if n != 4 or (everything and any(row[n] for row in rows))]
     return format_table([header[n] for n in shown], [[row[n] for n in shown] for row in rows], terminal_width())
 
 

@@ -194,7 +194,7 @@ def found_lengths(outcome: Outcome) -> list[tuple[str, str]]:
     shown = on_earth(outcome.moved(world.exported_from_run), world)
     rows = [("length of the path", path_length(shown))]
     if world.has_floor:
-        rows.append(("height of the camera over the floor", camera_height(shown)))
+        rows.append(("camera height above the floor", camera_height(shown)))
     if world.axes == "up" and shown.gaussian_map is not None:
         rows += list(zip(("length", "width", "height"), extents(shown), strict=False))
     texts = [(what, tape_text(*found, shown.metric, shown.metres)) for what, found in rows if found is not None]

@@ -135,7 +135,7 @@ def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Loo
     c, t = outcome.calibration, outcome.trajectory
     k = c.intrinsics
     spread = f" ± {c.focal_sd:.2f}" if c.focal_sd > 0 else ""
-    shutter = f", rows within {1000 * sum(map(abs, c.readout)):.1f} ms" if any(c.readout) else ""
+    shutter = f", rolling-shutter readout {1000 * sum(map(abs, c.readout)):.1f} ms" if any(c.readout) else ""
     sides = f"centre ({k.cx:.1f}, {k.cy:.1f}), {k.width}×{k.height}{shutter}"
     rows = [
         ("camera", f"{c.origin}: focal length {k.fx:.2f}{spread} px, {sides}"),
@@ -236,7 +236,7 @@ def files_of_export(run: RunFolder) -> list[tuple[str, str]]:
     """Name and size of the files of the stage, or that one is not as the stage left it, and of those that
     `msgs-slam export --only` has added since. Reads all of them."""
     root = run.stage("export")
-    wrong = {name: f"damaged or gone: msgs-slam resume {quoted(run.root)}" for name in run.damaged("export")}
+    wrong = {name: f"missing or damaged: msgs-slam resume {quoted(run.root)}" for name in run.damaged("export")}
     sizes = {p.relative_to(root).as_posix(): f"{p.stat().st_size / 1e6:.2f} MB" for p in root.rglob("*") if p.is_file()}
     return sorted((sizes | wrong).items())
 
@@ -318,13 +318,13 @@ def quality_section(outcome: Outcome, capture: Capture, views: RenderedViews | N
     series: list[tuple[str, str, NDArray, NDArray, str]] = []
     if views is not None:
         series.append(("PSNR of keyframes", "dB", np.array(views.ids), np.array(views.psnr), BLUE))
-    series.append(("Sharpness, 1 = usual", "", ids, capture.sharpness, ORANGE))
+    series.append(("Sharpness relative to the median", "", ids, capture.sharpness, ORANGE))
     series.append(("Mean brightness", "0..255", ids, capture.brightness, GREY))
     order = np.argsort(capture.point_ids)
-    series.append(("Points seen", "", capture.point_ids[order], capture.points[order], GREEN))
+    series.append(("Points visible", "", capture.point_ids[order], capture.points[order], GREEN))
     series.append(("Mean reliability U of the proxy depth", "0..1", capture.proxy_ids, capture.reliability, RED))
     return section(
-        "Quality along the way",
+        "Quality over time",
         '<div class="two">',
         *(_over_frames(name, unit, x, y, color) for name, unit, x, y, color in series if len(x)),
         "</div>",

@@ -151,11 +151,12 @@ def _row(outcome: Outcome, matched: MatchedTruth, pixels: FramePixels, row: int)
     ]
 
 
-def evaluation_table(result: dict[str, Any]) -> str:
-    """The protocol, then one row a figure; an empty cell says why."""
+def evaluation_table(result: dict[str, Any], with_protocol: bool = True) -> str:
+    """One row a figure, an empty cell says why; below, how each was measured."""
     lines = [f"# {result['run']} against {result['truth']}", ""]
-    lines += [f"- {line}" for line in result["protocol"]]
-    lines += ["", *markdown_table(TABLE_HEADER, evaluation_rows(result))]
+    lines += markdown_table(TABLE_HEADER, evaluation_rows(result))
+    if with_protocol:
+        lines += ["", *(f"- {line}" for line in result["protocol"])]
     return "\n".join(lines) + "\n"
 
 

@@ -28,7 +28,7 @@ class Entry:
     @property
     def lines(self) -> str:
         """Its name, and the text beside it; below it where the name is long."""
-        text = f"Only where asked for ({self.asked}): {self.text}" if self.asked else self.text
+        text = f"On request ({self.asked}): {self.text}" if self.asked else self.text
         first = "" if len(self.name) < _COLUMN - 1 else f"{self.name}\n"
         head = " " * _COLUMN if first else self.name.ljust(_COLUMN)
         return first + textwrap.fill(
@@ -44,7 +44,7 @@ _ENTRIES = (
     ),
     Entry(
         "images/, sparse/0/",
-        "a COLMAP data set: the undistorted frames whose place is known, and their camera, poses and points (binary, "
+        "a COLMAP data set: undistorted frames with a known pose, and their camera, poses and points (binary, "
         "text, and points3D.ply). Pinhole, no distortion left. A frame of which only the rotation is known is in "
         "trajectory.txt alone. Opens in COLMAP, pycolmap, gsplat (simple_trainer.py default --data_dir THIS_FOLDER "
         "--data_factor 1), the original trainer (train.py -s THIS_FOLDER).",
@@ -52,7 +52,7 @@ _ENTRIES = (
     ),
     Entry(
         "masks/",
-        "where people or --masks leave something out: NAME.png for the frame NAME, black is left out (colmap "
+        "parts left out for people or by --masks: NAME.png for the frame NAME, black is left out (colmap "
         "feature_extractor --ImageReader.mask_path masks).",
         "colmap",
     ),
@@ -118,7 +118,7 @@ _ENTRIES = (
         "floorplan", _ONLY.format("floorplan"),
     ),
     Entry("classes.json", 'number, name and colour of each class; 255 is "unknown".'),
-    Entry("scale.json", "how many metres a unit of the run is, its relative standard deviation, and who says so."),
+    Entry("scale.json", "how many metres a unit of the run is, its relative standard deviation, and its sources."),
     Entry(
         "tiles/",
         "where the map was made in parts (mapping.submap) or where asked for (msgs-slam export RUN --only tiles): 3D "
@@ -128,7 +128,7 @@ _ENTRIES = (
     ),
     Entry(
         "piece_2/ and so on",
-        "where some frames are not connected to the rest: the same for them, in a coordinate system of their own.",
+        "frames that are not connected to the rest: the same files for them, in a coordinate system of their own.",
     ),
     Entry("world.json", "what the axes are, how up was found, and the transform from the run's own frame.", "*"),
 )  # fmt: skip

@@ -67,7 +67,9 @@ def fetch(urls: Sequence[str], target: Path, size: int, sha256: str, progress: C
         log.warning("%s: %s", url, reason)
         reasons.append(f"{url}: {reason}")
     raise InputError(
-        "no mirror delivered the file:\n  " + "\n  ".join(reasons) + "\nCheck the network and try again, or bring the "
+        "download failed from every address:\n  "
+        + "\n  ".join(reasons)
+        + "\nCheck the network and try again, or bring the "
         "file from elsewhere: msgs-slam models pull --from FOLDER"
     )
 

@@ -266,14 +266,14 @@ def missing_networks() -> str | None:
     store = ModelStore.open()
     lacks = [
         what
-        for what, task in (("names", "segmentation"), ("metres", "depth"), ("masks of people", "person"))
+        for what, task in (("class names", "segmentation"), ("metric scale", "depth"), ("person masks", "person"))
         if store.first_here(task, metres_only=True) is None
     ]
     if not lacks:
         return None
     size = sum(m.bytes for m in store.with_needed([])) / 1e6
     named = ", ".join(lacks)
-    return f"no networks for {named} are installed: `msgs-slam models pull` fetches them ({size:.0f} MB, once)"
+    return f"Optional networks not installed ({named}; {size:.0f} MB): msgs-slam models pull"
 
 
 def _addresses(row: dict[str, Any]) -> tuple[str, ...]:

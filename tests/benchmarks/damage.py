@@ -109,7 +109,7 @@ def verdict(name: str, result: Result, file: str, same: bool, out: Path) -> str:
     if file == "manifest.json" and ("is not as the program left it" in said or "missing or damaged" in said):
         return "refused" if "msgs-slam resume" in said else f"WRONG: says {said[-200:]}"  # another run's, or a part
     if name == "report" and result.exit_code == 0 and not same:
-        listed = f"<td>{file.removeprefix('export/')}</td><td>damaged or gone"
+        listed = f"<td>{file.removeprefix('export/')}</td><td>missing or damaged"
         return "named" if listed in (out / "report.html").read_text() else "WRONG: used, and nothing said"
     if result.exit_code == 0 and name in ("status", "view") and Path(file).name in said:
         return "named"

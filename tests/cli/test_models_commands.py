@@ -41,6 +41,8 @@ def test_list_says_size_licence_and_what_is_not_pinned(cache: Path) -> None:
     assert "size unknown" in rows["dinov2-small-head"]
     assert "--trust" in rows["dinov2-small-head"]
     assert str(cache) in lines[-1]
+    assert "aliked-n16rot" in rows
+    assert "aliked-n16rot-export" not in rows, "it has no address, and is not here"
 
 
 def test_pull_without_a_network_says_what_to_do_and_asks_for_the_licence_first(cache: Path) -> None:

@@ -64,7 +64,7 @@ def test_they_are_said_as_the_tape_says_them(oracle_run: OracleRun) -> None:
     run = _exported(oracle_run(TURNED.inverse(), metric=False), TURNED)
     outcome = load_outcome(run)
     rows = dict(found_lengths(outcome))
-    assert list(rows)[:2] == ["length of the path", "height of the camera over the floor"]
+    assert list(rows)[:2] == ["length of the path", "camera height above the floor"]
     assert len(rows) == 5
     true = load_outcome(oracle_run())
     in_world = path_length(true)
@@ -78,7 +78,7 @@ def test_what_is_not_known_is_not_told(oracle_run: OracleRun) -> None:
     run = oracle_run()
     assert found_lengths(load_outcome(run)) == []
     rows = dict(found_lengths(load_outcome(_exported(run, TURNED, floor=False))))
-    assert "height of the camera over the floor" not in rows
+    assert "camera height above the floor" not in rows
     t = run.load(TRAJECTORY, "tracking")
     lost = tuple("lost" if i > 3 else "" for i in range(len(t.lost_reasons)))
     few = load_outcome(run)

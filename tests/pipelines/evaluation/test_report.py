@@ -89,7 +89,7 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     assert sum(float(share) for *_, share in swatches) == pytest.approx(100, abs=0.5)
     assert len(swatches) > 3
     assert "point_cloud.spz0.03 MB" in parsed.text
-    assert f"mesh.glbdamaged or gone: msgs-slam resume {run.root}" in parsed.text
+    assert f"mesh.glbmissing or damaged: msgs-slam resume {run.root}" in parsed.text
     lengths = found_lengths(load_outcome(run))
     assert len(lengths) == 5
     assert all(what in parsed.text and text in parsed.text for what, text in lengths)

@@ -100,7 +100,7 @@ function paint() {
   pen.fillStyle = "#fff";
   pen.fillRect(x - bar.pixels, y, bar.pixels, 3 * ratio);
   pen.textAlign = "right";
-  label(`${bar.text} at the turning point`, x, y - 6 * ratio);
+  label(`${bar.text} at the orbit centre`, x, y - 6 * ratio);
   pen.textAlign = "left";
 }
 
@@ -127,7 +127,7 @@ function addButtons() {
     find("play").classList.toggle("on", Boolean(state.playing));
     find("legend").hidden = state.mode !== "classes";
     find("help").textContent = state.move === "orbit"
-      ? "Drag: turn. Right drag or two fingers: move. Wheel or pinch: zoom. Double click: new middle."
+      ? "Drag: turn. Right drag or two fingers: move. Wheel or pinch: zoom. Double-click: set orbit centre."
       : "Drag: look around. W A S D or two fingers: walk. Q, E: down, up.";
     again();
   };
