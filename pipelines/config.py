@@ -150,7 +150,7 @@ class FramesConfig:
         0.025,
         "a new keyframe when points have moved by this fraction of the image width",
         within=(0.001, 0.5),
-        draft=0.05,
+        draft=0.06,
     )
     features: str = setting("sift", "sift; aliked, with LightGlue, needs networks of 49 MB", ("sift", "aliked"))
     max_features: int = setting(

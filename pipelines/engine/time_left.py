@@ -64,7 +64,7 @@ def machine_speed() -> float:
 
 def work_of(config: Config, figures: Mapping[str, Any]) -> Work:
     """Work of a run by the figures of its first stage and the settings: seconds of one thread, by counts that were
-    measured on kitchen, whiteroom_2 and staircase."""
+    measured on kitchen, normal and as a draft."""
     if not {"width", "height", "images", "keyframes"} <= figures.keys():
         return USUAL
     frames, keyframes, images = (int(figures[k]) for k in ("frames", "keyframes", "images"))
@@ -79,12 +79,12 @@ def work_of(config: Config, figures: Mapping[str, Any]) -> Work:
     visits = max(mapping.passes * keyframes, mapping.min_iterations)
     between = images - frames if config.global_ba.posed == "every" else 0
     seconds = {
-        "frames": 0.1 * frames + keyframes * math.sqrt(whole) * (0.4 * config.frames.max_features / 3000 + 0.8),
-        "proxy": keyframes * (0.75 + 1.4 * stereo * proxy.stereo_planes / 128),
-        "tracking": 0.08 * frames * whole + 0.1 * keyframes,
-        "mapping": 0.19 * visits * pixels(mapping.max_side) + 0.4 * keyframes,
-        "global_ba": 0.03 * keyframes + 0.07 * between * whole,
-        "export": 0.4 * keyframes * pixels(export.mesh_side) + 2,
+        "frames": 0.17 * frames + 0.6 * keyframes * math.sqrt(whole),
+        "proxy": keyframes * (0.79 + 1.17 * stereo * proxy.stereo_planes / 128),
+        "tracking": 0.08 * frames * whole + 0.12 * keyframes,
+        "mapping": 0.167 * visits * pixels(mapping.max_side) + 0.4 * keyframes,
+        "global_ba": 0.03 * keyframes + 0.08 * between * whole,
+        "export": keyframes * (0.22 * pixels(export.mesh_side) + 0.08) + 2,
     }
     threads, on_card = config.run.threads or available_cpus(), resolve_device(config.run.device) == "cuda"
     for name, serial in _SERIAL.items():

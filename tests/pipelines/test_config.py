@@ -174,13 +174,13 @@ def test_a_quality_is_a_set_of_values_that_what_is_given_besides_wins_over(tmp_p
 
 
 def test_a_run_remembers_its_quality_and_changes_it(tmp_path: Path) -> None:
-    draft = load_config(overrides=["frames.parallax=0.06"], quality="draft")
+    draft = load_config(overrides=["frames.parallax=0.08"], quality="draft")
     kept = load_config(base=draft)
     assert kept == draft
     best = load_config(base=draft, quality="best")
-    assert best == load_config(overrides=["frames.parallax=0.06"], quality="best")
+    assert best == load_config(overrides=["frames.parallax=0.08"], quality="best")
     assert best.proxy.depth == "best"
-    assert load_config(base=best, quality="normal") == load_config(overrides=["frames.parallax=0.06"])
+    assert load_config(base=best, quality="normal") == load_config(overrides=["frames.parallax=0.08"])
     with pytest.raises(InputError, match=r"--quality is one of draft, normal, best; got 'high'"):
         load_config(quality="high")
     with pytest.raises(InputError, match="did you mean best"):
