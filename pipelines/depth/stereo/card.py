@@ -30,17 +30,25 @@ def takes_kernels_on(device: str) -> bool:
 
 def match_planes(images: rules.StereoImages, planes: NDArray[np.float64], device: str) -> Array:
     """Return what `matching.match_planes` does, but for rounding."""
-    step, size, few = planes[1] - planes[0], images.image.shape, planes[:: rules.COARSE]
-    coarse, fine = (Matching.of(some, device) for some in (images.halved(), images))
-    cost = coarse.cost(few)
-    smoothed = coarse.smoothed(cost, rules.COARSE * rules.SMALL_STEP)
-    found = (coarse.picked(smoothed, few).cpu().numpy() - planes[0]) / step
-    alone, least = (x.cpu().numpy() for x in (cost.argmin(2), cost.amin(2)))
-    tried = rules.planes_to_try(found.astype(np.float32), rules.COARSE * alone, least, size, len(planes))
+    step, fine = planes[1] - planes[0], Matching.of(images, device)
+    tried = _planes_near(images, planes, rules.SMALL_STEP, device)
     total = fine.smoothed(leave_out(fine.cost(planes), tried), rules.SMALL_STEP)
     inverse = fine.picked(total, planes)
     inverse = fine.refined(fine.soften(inverse, rules.SOFT_VALUES[0] * step), rules.MOVE * step)
     return fine.soften(inverse, rules.SOFT_VALUES[1] * step).cpu().numpy()
+
+
+def _planes_near(
+    images: rules.StereoImages, planes: NDArray[np.float64], small_step: float, device: str
+) -> NDArray[np.bool_]:
+    step, size, few = planes[1] - planes[0], images.image.shape, planes[:: rules.COARSE]
+    coarse = Matching.of(small := images.halved(), device)
+    cost = coarse.cost(few)
+    if rules.is_large(small):
+        cost = leave_out(cost, _planes_near(small, few, rules.COARSE * small_step, device))
+    found = (coarse.picked(coarse.smoothed(cost, rules.COARSE * small_step), few).cpu().numpy() - planes[0]) / step
+    alone, least = (x.cpu().numpy() for x in (cost.argmin(2), cost.amin(2)))
+    return rules.planes_to_try(found.astype(np.float32), rules.COARSE * alone, least, size, len(planes))
 
 
 def leave_out(cost: Tensor, tried: NDArray[np.bool_]) -> Tensor:

@@ -24,6 +24,8 @@ REACH, MOVE = 2, 1 / 3
 MARGIN, AROUND, CLEAR = 2, 1, 0.2
 """Of the whole size: planes on either side of a coarse one that are tried, coarse pixels around it that try it, and the
 cost below which a match is clear by itself."""
+LARGE = 200
+"""Pixels on the shorter side: an image at half the size is halved again."""
 COARSE = 2
 """Of half the size every second plane: there they are as far apart in pixels as all are in the whole size."""
 SOFT_SIZE, SOFT_PLACE, SOFT_VALUES = 7, 2.0, (1.0, 0.7)
@@ -51,20 +53,34 @@ def match_planes(images: StereoImages, planes: NDArray[np.float64], bands: Bands
     """(H, W) inverse depth of the image, found among the inverse depths `planes` (D,), which are evenly spaced, and
     refined.
 
-    A match at half the size, whose windows see twice as far over plain surfaces, says which planes are tried where
-    (Rothermel et al., SURE, LC3D 2012): an eighth of them, so that the whole size costs little more than the half.
+    Planes are tried near those of a match at half the size alone: an eighth of them.
     """
-    step, best, coarse = planes[1] - planes[0], best_count(len(images.others)), images.halved()
-    cost = sweep_cost(*coarse, planes[::COARSE], best, bands)
-    found = pick_planes(smooth_cost(cost, coarse.image, COARSE * SMALL_STEP, JUMP, EDGE, bands))
-    alone, least = least_planes(cost)
-    tried = planes_to_try(COARSE * found, COARSE * alone, least, images.image.shape, len(planes))
-    cost = sweep_cost(*images, planes, best, bands, tried)
+    step, best = planes[1] - planes[0], best_count(len(images.others))
+    cost = sweep_cost(*images, planes, best, bands, _planes_near(images, planes, SMALL_STEP, bands))
     total = smooth_cost(cost, images.image, SMALL_STEP, JUMP, EDGE, bands)
     inverse = (planes[0] + pick_planes(total) * step).astype(np.float32)
     inverse = cv2.bilateralFilter(inverse, SOFT_SIZE, SOFT_VALUES[0] * step, SOFT_PLACE)
     inverse = refine_inverse_depth(*images, inverse, MOVE * step, REACH, STIFFNESS, best, bands)
     return np.asarray(cv2.bilateralFilter(inverse, SOFT_SIZE, SOFT_VALUES[1] * step, SOFT_PLACE), np.float32)
+
+
+def _planes_near(
+    images: StereoImages, planes: NDArray[np.float64], small_step: float, bands: Bands
+) -> NDArray[np.bool_]:
+    """Which of the planes to try where, as of `planes_to_try`, by a match at half the size among every second of them,
+    whose windows see twice as far over plain surfaces (Rothermel et al., SURE, LC3D 2012); and so on while that
+    `is_large`."""
+    small, few = images.halved(), planes[::COARSE]
+    tried = _planes_near(small, few, COARSE * small_step, bands) if is_large(small) else None
+    cost = sweep_cost(*small, few, best_count(len(images.others)), bands, tried)
+    found = pick_planes(smooth_cost(cost, small.image, COARSE * small_step, JUMP, EDGE, bands))
+    alone, least = least_planes(cost)
+    return planes_to_try(COARSE * found, COARSE * alone, least, images.image.shape, len(planes))
+
+
+def is_large(images: StereoImages) -> bool:
+    """Whether a match of these is prepared by one at half the size."""
+    return min(images.image.shape) >= LARGE
 
 
 def planes_to_try(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from msgs_slam.pipelines.depth.stereo import matching
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.depth.stereo.fill import (
     SURE,
@@ -131,8 +132,10 @@ def test_planes_near_the_coarse_ones_are_tried_and_what_is_thin_too() -> None:
     assert not planes_to_try(found, alone, least + 1, (40, 80), 64)[..., 40].any()
 
 
-def test_a_bar_thinner_than_the_coarse_window_is_found() -> None:
-    """Before a wall twice as far, by the whole match."""
+@pytest.mark.parametrize("large", [200, 40])
+def test_a_bar_thinner_than_the_coarse_window_is_found(monkeypatch: pytest.MonkeyPatch, large: int) -> None:
+    """Before a wall twice as far, by the whole match at two sizes, and at three."""
+    monkeypatch.setattr(matching, "LARGE", large)
 
     def view(cam_from_world: NDArray) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         v, u = (np.indices((80, 120)) + 0.5) / 2

@@ -98,7 +98,10 @@ def test_the_refinement_and_the_filter_are_those_of_the_cpu(pictures: tuple, on_
     assert np.abs(soft - inverse).max() > 0.01
 
 
-def test_the_whole_match_finds_the_plane(pictures: tuple) -> None:
+@pytest.mark.parametrize("large", [5, 200])
+def test_the_whole_match_finds_the_plane(pictures: tuple, monkeypatch: pytest.MonkeyPatch, large: int) -> None:
+    """At two sizes, and at three."""
+    monkeypatch.setattr(matching, "LARGE", large)
     found = card.match_planes(matching.StereoImages(*pictures), PLANES, DEVICE)
     expected = matching.match_planes(matching.StereoImages(*pictures), PLANES, BANDS)
     truth = 1 / view_of_plane(np.eye(4), 0.3)[1][:ROWS, :COLUMNS]
