@@ -3,6 +3,8 @@
     python -m tests.benchmarks.rooms make DIR --set judge                   rooms of a set and the stereo's first pass
     python -m tests.benchmarks.rooms measure DIR NAME --set judge           the product's depth of them, kept as NAME
     python -m tests.benchmarks.rooms table DIR OLD [NEW] --set judge        one against the other
+    python -m tests.benchmarks.rooms learn DIR                              the model that chooses, from the set `learn`
+    python -m tests.benchmarks.rooms measure DIR NAME --choice              the depth that it chooses
 
 A default about depth is chosen on `choose` and reported on `judge`. A room is a seed: walls, textures, light, furniture
 (of Debian's `sweethome3d-furniture`, downloaded by apt-get or given by --package; none of it is in the repository), a
@@ -21,12 +23,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .choice.completion import Completion
+from .choice.model import load_model
 from .clip import Clip, make_clip
 from .furniture import furniture
 
 SETS = {"choose": (1000, 40), "judge": (2000, 40), "learn": (10_000, 300)}
 """First seed and number of rooms; seeds without a place to walk are passed over."""
 SURE, OFF = 0.3, 0.05
+MODEL = "choice.npz"
 
 
 def seeds_of(folder: Path, name: str, make: bool = False, package: Path | None = None, most: int = 0) -> list[int]:
@@ -51,8 +56,20 @@ def seeds_of(folder: Path, name: str, make: bool = False, package: Path | None =
     return found
 
 
-def measure(folder: Path, seeds: list[int], name: str) -> None:
-    """Keep depth (0: none) and confidence of every keyframe by the product as it is."""
+def learn_choice(folder: Path, most: int) -> None:
+    """Leave the weights of the choice in the folder; tested on the rooms to choose on."""
+    from .choice.learn import gather, learn
+
+    chosen = seeds_of(folder, "choose")
+    learned = seeds_of(folder, "learn", most=most)
+    parts = gather(folder, learned + chosen), gather(folder, learned, as_worn=True)
+    evidence, errors, rooms = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    print(f"{len(np.unique(rooms))} rooms, {len(rooms)} pixels", flush=True)
+    np.savez(folder / MODEL, **learn(evidence, errors, rooms, np.isin(rooms, chosen)).weights())
+
+
+def measure(folder: Path, seeds: list[int], name: str, choice: bool = False) -> None:
+    """Keep depth (0: none) and confidence of every keyframe by the product as it is, or by the learned choice."""
     target = folder / "depth" / name
     target.mkdir(parents=True, exist_ok=True)
     for seed in seeds:
@@ -60,7 +77,8 @@ def measure(folder: Path, seeds: list[int], name: str) -> None:
             continue
         provider, frames = Clip.load(folder / f"{seed}.npz").stereo(folder / "stereo" / str(seed))
         start = time.process_time()
-        found = [provider.estimate(f) for f in frames]
+        completion = Completion(provider, load_model(folder / MODEL) if choice else None)
+        found = [completion.estimate(f.id) if choice else provider.estimate(f) for f in frames]
         spent = (time.process_time() - start) / len(frames)
         depth, confidence = np.stack([f.depth for f in found]), np.stack([f.confidence for f in found])
         np.savez_compressed(
@@ -123,19 +141,22 @@ def _print(title: str, rows: list[dict[str, NDArray]], summary: object) -> None:
 def main() -> None:
     """Parse, do."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("make", "measure", "table"))
+    parser.add_argument("what", choices=("make", "measure", "table", "learn"))
     parser.add_argument("folder", type=Path, metavar="DIR")
     parser.add_argument("names", nargs="*", metavar="NAME")
     parser.add_argument("--set", choices=SETS, default="choose")
+    parser.add_argument("--choice", action="store_true", help="measure the learned choice, not the product")
     parser.add_argument("--rooms", type=int, default=0, help="only the first so many of the set")
     parser.add_argument("--package", type=Path, help="the .deb file of the furniture")
     given = parser.parse_args()
     cv2.setNumThreads(1)
     seeds = seeds_of(given.folder, given.set, given.what == "make", given.package, given.rooms)
     if given.what == "measure":
-        measure(given.folder, seeds, *given.names)
+        measure(given.folder, seeds, *given.names, choice=given.choice)
     elif given.what == "table":
         table(given.folder, seeds, given.names)
+    elif given.what == "learn":
+        learn_choice(given.folder, given.rooms)
 
 
 if __name__ == "__main__":

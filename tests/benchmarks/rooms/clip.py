@@ -3,7 +3,7 @@ give, and the product's stereo on them."""
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import cv2
@@ -100,6 +100,36 @@ def make_clip(seed: int, catalogue: Catalogue) -> Clip | None:
     return Clip(room.kind, focal, images, depths.astype(np.float16), classes, known, *sparse)
 
 
+def worn(clip: Clip, seed: int) -> Clip:
+    """The clip by a worse camera: noise, blur, distortion that is left, poses and focal length that are off by more."""
+    r = np.random.default_rng(seed)
+    height, width = clip.images.shape[1:3]
+    noise, blur, quality = r.uniform(0.5, 5), r.uniform(0, 1.2), int(r.integers(60, 95))
+    y, x = (np.mgrid[:height, :width] + 0.5 - np.array([height / 2, width / 2])[:, None, None]) / width
+    bend = 1 + r.normal() * 0.01 * (x**2 + y**2) / clip.focal**2
+    at = (
+        (x * bend * width + width / 2 - 0.5).astype(np.float32),
+        (y * bend * width + height / 2 - 0.5).astype(np.float32),
+    )
+    images = []
+    for image in clip.images:
+        seen = cv2.remap(image, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        seen = cv2.GaussianBlur(seen, (0, 0), blur) if blur > 0.3 else seen
+        coarse = cv2.resize(r.normal(size=(height // 2, width // 2, 3)), (width, height))
+        stored = np.clip(seen + noise * 0.7 * (r.normal(size=seen.shape) + coarse), 0, 255).astype(np.uint8)
+        images.append(_compressed(stored, quality))
+    poses = _shaken(clip.cam_from_world, float(r.choice([0.0005, 0.001, 0.002])), r)
+    poses[:, :3, 3] += np.cumsum(r.normal(size=(len(poses), 3)) * 0.0007, 0)
+    focal = clip.focal * float(1 + r.normal() * 0.004)
+    return replace(clip, images=np.stack(images), cam_from_world=poses, focal=focal)
+
+
+def _compressed(image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    """An RGB image (h, w, 3) as it is after JPEG."""
+    stored = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return np.asarray(cv2.imdecode(stored, cv2.IMREAD_COLOR)[..., ::-1], np.uint8).copy()
+
+
 def _shaken(cam_from_world: Array, by: float, r: Random) -> Array:
     """Poses of structure from motion are a little off."""
     out = cam_from_world.copy()
@@ -192,8 +222,7 @@ def _exposed(light: list[NDArray[np.float32]], r: Random) -> list[NDArray[np.uin
         if shaken and r.random() < 0.5:
             x = cv2.filter2D(x, -1, _shake(r))
         stored = np.clip(x + r.normal(size=x.shape) * grain, 0, 255).astype(np.uint8)
-        bytes_ = cv2.imencode(".jpg", np.ascontiguousarray(stored[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-        out.append(np.asarray(cv2.imdecode(bytes_, cv2.IMREAD_COLOR)[..., ::-1], np.uint8).copy())
+        out.append(_compressed(stored, quality))
     return out
 
 

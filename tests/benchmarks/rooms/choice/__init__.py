@@ -1,0 +1,1 @@
+"""Completing a keyframe's depth by a learned choice among geometric candidates: measured here, not in the product."""
