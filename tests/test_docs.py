@@ -227,6 +227,17 @@ def test_settings_page_has_every_setting() -> None:
     assert not re.findall(r"^\| `\w+` \| `[^|]*` \|  \|", page, flags=re.MULTILINE)  # what each may be
 
 
+def test_the_page_of_public_recordings_is_that_of_the_figures_kept() -> None:
+    """`python tests/benchmarks/public.py` writes it."""
+    sys.path.insert(0, str(BENCHMARKS))
+    try:
+        from public import KEPT, PAGE, page
+    finally:
+        sys.path.pop(0)
+    assert PAGE.read_text(encoding="utf-8") == page(json.loads(KEPT.read_text(encoding="utf-8")))
+    assert PAGE.read_text(encoding="utf-8").count("| run here |") == 9
+
+
 def test_the_man_page_is_that_of_todays_commands() -> None:
     """`python docs/man_page.py` writes it."""
     sys.path.insert(0, str(SITE))
