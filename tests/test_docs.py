@@ -148,6 +148,21 @@ print(json.dumps(wrong))
 """
 
 
+@pytest.mark.parametrize("what", [[], ["--iteration", "--pose", "--memory"]], ids=["table", "others"])
+def test_the_bench_of_the_renderer_runs(what: list[str], tmp_path: Path) -> None:
+    """On images of a thumbnail's size: what its backends can do changes, and it calls them itself."""
+    tiny = f"import sys; sys.path.insert(0, {str(BENCHMARKS)!r}); import renderer"
+    tiny += "; renderer.ROWS = 4 * [(48, 32, 300, 4)]; renderer.main()"
+    rows = tmp_path / "rows.json"
+    words = ["-c", tiny, "--device", "cpu", "--repeats", "1", "--json", str(rows), *what]
+    done = subprocess.run([sys.executable, *words], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    if what:
+        assert len(done.stdout.splitlines()) >= 3
+    else:
+        assert {row["backend"] for row in json.loads(rows.read_text())} == {"cpu", "reference"}
+
+
 def test_pictures_are_there_and_small() -> None:
     names = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", DOCS[0].read_text(encoding="utf-8"))
     assert names

@@ -38,7 +38,7 @@ section{background:var(--card);border:1px solid var(--line);border-radius:12px;p
 .two{display:grid;grid-template-columns:repeat(auto-fill,minmax(440px,1fr));gap:14px}
 .plot{width:100%;height:auto;display:block}
 table{border-collapse:collapse;width:100%;font-size:14px}
-th,td{text-align:left;padding:6px 10px;border-bottom:1px solid var(--line);vertical-align:top}
+th,td{text-align:left;padding:6px 10px;border-bottom:1px solid var(--line);vertical-align:top;overflow-wrap:anywhere}
 th{color:var(--soft);font-weight:600}
 img{max-width:100%;border-radius:6px;display:block}
 ul{margin:0;padding-left:20px}li{margin:4px 0}
@@ -47,13 +47,14 @@ summary{cursor:pointer;color:var(--accent)}
 .advice{border-left:5px solid #f59e0b}.fine{border-left:5px solid #16a34a}
 .grid{display:grid;grid-template-columns:repeat(4,1fr);gap:6px}
 .grid div{font-size:12px;color:var(--soft)}
-code{background:#f3f4f6;padding:1px 5px;border-radius:4px}
+code{background:#f3f4f6;padding:1px 5px;border-radius:4px;overflow-wrap:anywhere}
 .legend{display:flex;flex-wrap:wrap;gap:4px 16px;margin-top:12px;font-size:13px}
 .legend i{display:inline-block;width:13px;height:13px;border-radius:3px;margin-right:6px;vertical-align:-2px}
-.legend.scale i{width:220px;margin:3px 6px}
+.legend.scale i{width:220px;max-width:50%;margin:3px 6px}
 .legend span{color:var(--soft)}
 details{margin-top:10px}pre{white-space:pre-wrap;overflow-wrap:anywhere}
-@media (max-width:700px){.grid{grid-template-columns:repeat(2,1fr)}.two{grid-template-columns:1fr}}
+@media (max-width:700px){.grid{grid-template-columns:repeat(2,1fr)}.two{grid-template-columns:1fr}
+main{padding:16px 8px 40px}section{padding:12px}th,td{padding:5px 4px;font-size:13px}}
 @media print{@page{margin:14mm}
 body{background:#fff;font-size:11px;print-color-adjust:exact;-webkit-print-color-adjust:exact}
 main{max-width:none;padding:0}section{border:0;padding:6px 0;margin:8px 0}

@@ -125,7 +125,8 @@ _AFTER = {
 
 
 def _advice_section(outcome: Outcome, capture: Capture, sparse: SparseModel | None, loops: list[LoopEdge]) -> str:
-    lines = advice(outcome, capture, sparse, loops, outcome.keyframe_psnr)
+    warned = [f"{stage}: {w}" for stage, record in outcome.records.items() for w in record.warnings]
+    lines = warned + advice(outcome, capture, sparse, loops, outcome.keyframe_psnr)
     if not lines:
         return section("What would improve it", "<p>No problem found in this capture.</p>", kind="fine")
     return section("What would improve it", bullets(lines), kind="advice")
@@ -155,9 +156,7 @@ def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Loo
         rows.append(("loops", f"{len(loops)}: {text}" if loops else "none"))
     lost = [f"frames {s.first}–{s.last} ({s.start:.2f}–{s.end:.2f} s): {s.reason}" for s in lost_stretches(outcome)]
     rows.append(("frames without a pose", f"{len(lost)} stretches, below" if lost else f"none of {len(t.frame_ids)}"))
-    warnings = [f"{stage}: {w}" for stage, record in outcome.records.items() for w in record.warnings]
-    listed = {"Frames without a pose": lost, "Warnings": warnings}
-    extra = "".join(f"<h3>{title}</h3>{bullets(lines)}" for title, lines in listed.items() if lines)
+    extra = f"<h3>Frames without a pose</h3>{bullets(lost)}" if lost else ""
     return section("What was found", table(("", ""), rows), extra)
 
 
@@ -201,7 +200,7 @@ def _truth_section(evaluation: dict[str, Any], run: RunFolder) -> str:
     beside = run.evaluation_file.with_name(PATH_FROM_ABOVE)
     drawn += drawing(read_bytes(beside), "The camera path from above") if beside.exists() else ""
     return section(
-        f"Against the truth: {evaluation['truth']}",
+        f"Compared with ground truth: {evaluation['truth']}",
         f'<div class="two">{drawn}</div>',
         table(TABLE_HEADER, evaluation_rows(evaluation)),
         "<details><summary>How this was measured</summary>", bullets(evaluation["protocol"]), "</details>",
@@ -237,8 +236,12 @@ def files_of_export(run: RunFolder) -> list[tuple[str, str]]:
     `msgs-slam export --only` has added since. Reads all of them."""
     root = run.stage("export")
     wrong = {name: f"missing or damaged: msgs-slam resume {quoted(run.root)}" for name in run.damaged("export")}
-    sizes = {p.relative_to(root).as_posix(): f"{p.stat().st_size / 1e6:.2f} MB" for p in root.rglob("*") if p.is_file()}
+    sizes = {p.relative_to(root).as_posix(): _size(p.stat().st_size) for p in root.rglob("*") if p.is_file()}
     return sorted((sizes | wrong).items())
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e6:.2f} MB" if count >= 10_000 else f"{count / 1e3:.1f} kB"
 
 
 def _settings_section(outcome: Outcome) -> str:

@@ -75,7 +75,7 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
         "What the map shows",
         "What was found",
         "Camera path",
-        "Against the truth",
+        "Compared with ground truth",
         "Stages",
         "Settings",
     ):
@@ -89,6 +89,7 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     assert sum(float(share) for *_, share in swatches) == pytest.approx(100, abs=0.5)
     assert len(swatches) > 3
     assert "point_cloud.spz0.03 MB" in parsed.text
+    assert re.search(r"world\.json\d+\.\d kB", parsed.text)
     assert f"mesh.glbmissing or damaged: msgs-slam resume {run.root}" in parsed.text
     lengths = found_lengths(load_outcome(run))
     assert len(lengths) == 5
