@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ...formats.mesh import (
     MeshBlocks,
@@ -34,8 +35,8 @@ from ..system.values import load_value, save_value
 from ..types import VOID
 from .extra.texture import make_textured
 from .planes import Planes, planes_of, snap_to_planes
-from .surface import Region, chunk_surfaces, joined, weld
-from .volume import Grid, fuse, make_grid
+from .surface import Region, chunk_surfaces, closed, joined, weld
+from .volume import BEHIND, Grid, fuse, make_grid
 
 TRUNCATION = 3.0
 """Voxels on either side of a surface that a depth speaks for."""
@@ -213,7 +214,7 @@ def _region(
     near = grid.views_of(chunks)
     fusing = (views[n].shown for n in progress.track(near, "fusing" + of, len(near)))
     triangles = chunk_surfaces(fuse(grid, chunks, fusing), chunks, LEAST_WEIGHT)
-    surface = weld(triangles, chunks, grid.voxel)
+    surface = closed(weld(triangles, chunks, grid.voxel), (views[n].shown for n in near), BEHIND * grid.truncation)
     painting = (views[n] for n in progress.track(near, "painting" + of, len(near)))
     return Region(surface, *paint(surface.vertices, painting, class_ids, 2 * grid.truncation))
 
@@ -230,7 +231,8 @@ def paint(
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """colors (V, 3) uint8 and labels (V,) uint8: weighted mean and vote of the views that see a vertex.
 
-    A view sees a vertex where its depth there agrees within `tolerance`. Unseen ones are grey and VOID.
+    A view sees a vertex where its depth there agrees within `tolerance`. Unseen ones, as on the rims behind steps, are
+    as the nearest seen one; grey and VOID where none is.
     """
     total = np.zeros((len(vertices), 3), np.float32)
     weight = np.zeros(len(vertices), np.float32)
@@ -243,6 +245,10 @@ def paint(
         if view.channels is not None and class_ids:
             channel = view.channels[place]
             votes[rows[channel >= 0], channel[channel >= 0]] += share[channel >= 0]
+    seen, unseen = np.flatnonzero(weight > 0), np.flatnonzero(weight == 0)
+    if len(seen) and len(unseen):
+        nearest = seen[cKDTree(vertices[seen]).query(vertices[unseen])[1]]
+        total[unseen], weight[unseen], votes[unseen] = total[nearest], weight[nearest], votes[nearest]
     colors = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-9)[:, None], 127.5)
     table = np.array([*class_ids, VOID] if class_ids else [VOID, VOID], np.uint8)
     labels = np.where(votes.max(1) > 0, votes.argmax(1), len(table) - 1)

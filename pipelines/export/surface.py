@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -17,8 +17,10 @@ from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
 from ...formats.mesh import MeshBlocks
+from ..geometry.camera import project
+from ..geometry.posed_depth import PosedDepth
 from ..system.jit import kernel
-from .volume import CHUNK, SIDE, Volume, chunk_keys
+from .volume import CHUNK, HINT, SIDE, Volume, chunk_keys
 
 LEAST_PIECE = 0.01
 """Connected pieces with fewer faces than this share of the largest one's are floaters."""
@@ -31,21 +33,22 @@ _STEPS = 1000
 class Surface:
     """vertices (V, 3) in the world, faces (F, 3); pieces (V,), which connected piece each vertex belongs to, -1 without
     a face. The vertices `border` (N,), which those of other regions may be, have the places `border_places` (N, 3) in
-    thousandths of a voxel."""
+    thousandths of a voxel; hinted (F,): faces that no view sees, but that hints say bound what is solid."""
 
     vertices: NDArray[np.float32]
     faces: NDArray[np.int32]
     pieces: NDArray[np.int32]
     border: NDArray[np.int64]
     border_places: NDArray[np.int64]
+    hinted: NDArray[np.bool_]
 
 
-Triangles = tuple[NDArray[np.float64], NDArray[np.int32]]
-"""Places (V, 3) and faces (F, 3)."""
+Triangles = tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.bool_]]
+"""Places (V, 3), faces (F, 3), and which of these no view sees (F,), but hints say are solid."""
 
 
 def chunk_surfaces(volume: Volume, chunks: NDArray[np.int32], least_weight: float) -> list[Triangles]:
-    """The surface in each of these chunks; only where all eight corners of a cell were seen."""
+    """The surface in each of these chunks; only where all eight corners of a cell were seen, or hinted at as solid."""
     index = {tuple(b): n for n, b in enumerate(volume.blocks.tolist())}
     ordered = chunks[np.lexsort(chunks.T[::-1])]
     return [_chunk_surface(volume, index, chunk * CHUNK, least_weight) for chunk in ordered]
@@ -57,7 +60,7 @@ def _chunk_surface(
     """The surface in one chunk; its last layer of voxels is its neighbours' first, so that no cell is left out."""
     size = CHUNK * SIDE + 1
     distance = np.ones((size, size, size), np.float32)
-    seen = np.zeros((size, size, size), bool)
+    seen, sure = np.zeros((2, size, size, size), bool)
     for dx in range(CHUNK + 1):
         for dy in range(CHUNK + 1):
             for dz in range(CHUNK + 1):
@@ -67,19 +70,21 @@ def _chunk_surface(
                 place = tuple(slice(d * SIDE, min(d * SIDE + SIDE, size)) for d in (dx, dy, dz))
                 cut = tuple(slice(0, s.stop - s.start) for s in place)
                 distance[place] = volume.distance[n][cut]
-                seen[place] = volume.weight[n][cut] >= least_weight
+                weight = volume.weight[n][cut]
+                sure[place] = weight >= least_weight
+                seen[place] = sure[place] | ((weight >= HINT * least_weight) & (distance[place] < 0))
     distance[~seen] = 1
     if distance.min() >= 0:
-        return np.zeros((0, 3)), np.zeros((0, 3), np.int32)
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros(0, bool)
     # Free space is positive: "descent" makes the faces look that way.
     points, triangles, _, _ = marching_cubes(distance, 0.0, gradient_direction="descent")
-    whole = _whole_cells(seen)
-    cell = np.floor(points[triangles].mean(1)).astype(int).clip(0, size - 2)
-    kept = triangles[whole[cell[:, 0], cell[:, 1], cell[:, 2]]]
+    cell = tuple(np.floor(points[triangles].mean(1)).astype(int).clip(0, size - 2).T)
+    is_whole = _whole_cells(seen)[cell]
+    kept, hinted = triangles[is_whole], ~_whole_cells(sure)[cell][is_whole]
     used = np.unique(kept)
     renumber = np.zeros(len(points), np.int32)
     renumber[used] = np.arange(len(used))
-    return (points[used] + first * SIDE) * volume.voxel, renumber[kept]
+    return (points[used] + first * SIDE) * volume.voxel, renumber[kept], hinted
 
 
 def _whole_cells(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -92,8 +97,8 @@ def _whole_cells(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def weld(parts: Sequence[Triangles], chunks: NDArray[np.int32], voxel: float) -> Surface:
     """The surface in a region of chunks. Vertices that neighbouring ones both have become one; triangles that thereby
     lose their area go."""
-    firsts = np.cumsum([0, *(len(points) for points, _ in parts)], dtype=np.int32)
-    points = np.concatenate([np.zeros((0, 3)), *(points for points, _ in parts)])
+    firsts = np.cumsum([0, *(len(points) for points, _, _ in parts)], dtype=np.int32)
+    points = np.concatenate([np.zeros((0, 3)), *(points for points, _, _ in parts)])
     keys = np.round(points / (voxel / _STEPS)).astype(np.int64)
     order = np.lexsort(keys.T[::-1])  # that of rows; np.unique's needs ten times the time and twice the memory
     is_new = np.ones(len(keys), bool)
@@ -104,10 +109,54 @@ def weld(parts: Sequence[Triangles], chunks: NDArray[np.int32], voxel: float) ->
     vertices, keys = points[first].astype(np.float32), keys[first]
     del points, order
     no_faces = np.zeros((0, 3), np.int32)
-    faces = one[np.concatenate([no_faces, *(f + start for (_, f), start in zip(parts, firsts, strict=False))])]
-    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    faces = one[np.concatenate([no_faces, *(f + start for (_, f, _), start in zip(parts, firsts, strict=False))])]
+    hinted = np.concatenate([np.zeros(0, bool), *(h for _, _, h in parts)])
+    has_area = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     border = _border(keys, chunks)
-    return Surface(vertices, faces, _pieces(faces, len(vertices)), border, keys[border])
+    faces, hinted = faces[has_area], hinted[has_area]
+    return Surface(vertices, faces, _pieces(faces, len(vertices)), border, keys[border], hinted)
+
+
+def closed(surface: Surface, views: Iterable[PosedDepth], reach: float) -> Surface:
+    """The surface with those hinted faces alone that a view needs: there it knows a depth, within
+    `reach` of the face, but sees no other one."""
+    needed = ~surface.hinted
+    for view in views:
+        pose = view.cam_from_world
+        xy, z = project(surface.vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3], view.intrinsics)
+        z = np.where(np.isfinite(xy).all(1) & (z > 0), z, 0)
+        _need(np.nan_to_num(xy), z, surface.faces, surface.hinted, view.trust <= 0, view.depth, reach, needed)
+    faces = surface.faces[needed]
+    pieces = _pieces(faces, len(surface.vertices))
+    return replace(surface, faces=faces, pieces=pieces, hinted=surface.hinted[needed])
+
+
+@kernel
+def _need(xy, z, faces, hinted, covered, depth, reach, needed):  # type: ignore[no-untyped-def]
+    """Mark the pixels (H, W) whose centre a seen face covers, then the hinted faces that cover others."""
+    height, width = covered.shape
+    for second in (False, True):
+        for f in range(len(faces)):
+            a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+            if hinted[f] != second or (second and needed[f]) or z[a] <= 0 or z[b] <= 0 or z[c] <= 0:
+                continue
+            ax, ay, bx, by, cx, cy = xy[a, 0], xy[a, 1], xy[b, 0], xy[b, 1], xy[c, 0], xy[c, 1]
+            top, bottom = max(min(ay, by, cy), 0.0), min(max(ay, by, cy), height - 0.5)
+            left, right = max(min(ax, bx, cx), 0.0), min(max(ax, bx, cx), width - 0.5)
+            sign = 1.0 if (bx - ax) * (cy - ay) > (cx - ax) * (by - ay) else -1.0
+            for row in range(int(top), int(bottom + 0.5)):
+                y = row + 0.5
+                for column in range(int(left), int(right + 0.5)):
+                    x = column + 0.5
+                    if (
+                        sign * ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) >= 0
+                        and sign * ((cx - bx) * (y - by) - (cy - by) * (x - bx)) >= 0
+                        and sign * ((ax - cx) * (y - cy) - (ay - cy) * (x - cx)) >= 0
+                    ):
+                        if not second:
+                            covered[row, column] = True
+                        elif not covered[row, column] and abs(depth[row, column] - (z[a] + z[b] + z[c]) / 3) < reach:
+                            needed[f] = True
 
 
 def _border(places: NDArray[np.int64], chunks: NDArray[np.int32]) -> NDArray[np.int64]:

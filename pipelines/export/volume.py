@@ -24,6 +24,10 @@ SIDE = 8
 """Voxels along the side of a block."""
 CHUNK = 8
 """Blocks along the side of a chunk, of which regions are made; surfaces are extracted chunk by chunk."""
+BEHIND, HINT = 3.0, 0.01
+"""Truncations behind a depth that it takes for solid, and with which share of its weight: so little that what another
+view sees there wins. Where views disagree by more than the truncation, the surface steps from one depth to the other
+through voxels that no view sees: without these hints it has a slit along every such step."""
 _AT_ONCE = 8_000
 """Blocks of a region, 4 kB each, without the layer that it shares with its neighbours."""
 
@@ -96,7 +100,9 @@ class Grid:
         """The numbers of the views that may see anything of the chunks."""
         side = self.voxel * SIDE
         centers, radius = (chunks * CHUNK + (CHUNK + 1) / 2) * side, (CHUNK + 1) / 2 * side * 3**0.5
-        return [n for n, f in enumerate(self.frusta) if f.far and f.meets(centers, radius, self.truncation).any()]
+        return [
+            n for n, f in enumerate(self.frusta) if f.far and f.meets(centers, radius, BEHIND * self.truncation).any()
+        ]
 
 
 def make_grid(views: Sequence[PosedDepth], voxel: float, truncation_voxels: float, max_blocks: int) -> Grid:
@@ -110,7 +116,7 @@ def make_grid(views: Sequence[PosedDepth], voxel: float, truncation_voxels: floa
 
 
 def touched_blocks(views: Iterable[PosedDepth], voxel: float, truncation: float) -> NDArray[np.int32]:
-    """(B, 3) coordinates of the blocks within the truncation of a seen surface, sorted.
+    """(B, 3) coordinates of the blocks within the truncation of a seen surface, or hinted at behind it, sorted.
 
     Those further than a million blocks from the origin are left out.
     """
@@ -121,7 +127,7 @@ def touched_blocks(views: Iterable[PosedDepth], voxel: float, truncation: float)
         points = unproject_depth(view.depth, view.intrinsics)[::3, ::3]
         points = points[(view.trust[::3, ::3] > 0) & (view.depth[::3, ::3] > 0)]
         rays = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-9)
-        offsets = np.arange(-1, 1.01, 0.5)[:, None, None] * truncation
+        offsets = np.arange(-1, BEHIND + 0.01, 0.5)[:, None, None] * truncation
         near = ((points + offsets * rays).reshape(-1, 3)) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
         waiting.append(np.unique(voxel_keys(near, voxel * SIDE)))
         if sum(map(len, waiting)) > len(found):
@@ -143,7 +149,7 @@ def fuse(grid: Grid, chunks: NDArray[np.int32], views: Iterable[PosedDepth]) -> 
     centers, radius = (blocks + 0.5) * (voxel * SIDE), voxel * SIDE * 0.87
 
     def integrate(view: PosedDepth) -> None:
-        rows = np.flatnonzero(Frustum.of(view).meets(centers, radius, truncation))
+        rows = np.flatnonzero(Frustum.of(view).meets(centers, radius, BEHIND * truncation))
         parts, pose = np.array_split(rows, get_threads()), np.ascontiguousarray(view.cam_from_world)
         seen = view.depth, view.trust, pose, view.intrinsics.numbers
         for_each(lambda n: _integrate(parts[n], blocks, distance, weight, *seen, voxel, truncation), len(parts))
@@ -173,9 +179,11 @@ def _integrate(rows, blocks, distance, weight, depth, depth_weight, pose, camera
                         continue
                     column, row = int(u), int(v)
                     d, share = depth[row, column], depth_weight[row, column]
-                    if d <= 0 or share <= 0 or d - zc < -truncation:
+                    if d <= 0 or share <= 0 or d - zc < -BEHIND * truncation:
                         continue
-                    value = min(1.0, (d - zc) / truncation)
+                    value = min(1.0, max(-1.0, (d - zc) / truncation))
+                    if d - zc < -truncation:
+                        share *= HINT
                     total = weight[b, i, j, k] + share
                     distance[b, i, j, k] += (value - distance[b, i, j, k]) * share / total
                     weight[b, i, j, k] = total
