@@ -65,8 +65,8 @@ def machine_speed() -> float:
 def work_of(config: Config, figures: Mapping[str, Any]) -> Work:
     """Work of a run by the figures of its first stage and the settings: seconds of one thread, by counts that were
     measured on kitchen, normal and as a draft."""
-    if not {"width", "height", "images", "keyframes"} <= figures.keys():
-        return USUAL
+    if config.run.method == "paper" or not {"width", "height", "images", "keyframes"} <= figures.keys():
+        return USUAL  # nothing of that kind has been measured
     frames, keyframes, images = (int(figures[k]) for k in ("frames", "keyframes", "images"))
     width, height = int(figures["width"]), int(figures["height"])
 

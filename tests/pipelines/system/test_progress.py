@@ -60,6 +60,7 @@ def test_work_grows_with_what_there_is_to_do() -> None:
         assert 0.4 * seconds < work_of(four, figures).seconds[name] < seconds
         assert work_of(one, figures | {"keyframes": 92, "frames": 200, "images": 600}).seconds[name] > 1.7 * seconds
     assert work_of(one, {"keyframes": 46}) == USUAL, "a run of an earlier version"
+    assert work_of(load_config(overrides=["run.method=paper"], base=one), figures) == USUAL
     said = StageEvent("frames", 1, 6, ENDED, 60.0, {}, lambda: 360.0, usual.text)
     assert said.left_text == "; about 6 min left on this machine: 46 keyframes at 640 px"
 
