@@ -3,7 +3,8 @@
     python tests/benchmarks/textured_mesh.py RUN.msgs [--folder DIR]      exported files of the run, or those in DIR
 
 dB over the pixels that both meshes cover, with each picture's exposure, mean over pictures; "between" are the frames
-that no mesh was made from. Drawn with four samples a pixel.
+that no mesh was made from. Drawn with four samples a pixel. "Holes": background within five pixels of the mesh or
+enclosed by it, as a share of the silhouette, in five keyframes spread over the path.
 """
 
 import argparse
@@ -16,8 +17,9 @@ import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.ndimage import binary_fill_holes
 
-from msgs_slam.formats.images import read_rgb, write_rgb
+from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.geometry.camera import project
@@ -44,12 +46,12 @@ def main() -> None:
 def measure(root: Path, folder: Path, every: int, picture: Path | None) -> None:
     """One line for the keyframes, one for the frames between."""
     outcome = load_outcome(RunFolder(root))
-    outcome = outcome.moved(WORLD.read(folder / "world.json").exported_from_run)
+    outcome = outcome.moved((world := WORLD.read(folder / "world.json")).exported_from_run)
     trajectory, camera = outcome.trajectory, outcome.calibration.intrinsics
     plain = read_mesh_ply(folder / "mesh.ply")
     drawers = [
         VertexColours(plain.vertices, plain.faces, plain.colors),
-        Textured(folder / "mesh_textured.obj", folder / "mesh_textured.png"),
+        Textured(folder / "mesh.glb", world.gltf_from_exported),
     ]
     rows: dict[bool, list[tuple[float, ...]]] = {True: [], False: []}
     sheets = []
@@ -75,9 +77,23 @@ def measure(root: Path, folder: Path, every: int, picture: Path | None) -> None:
                 f"  {name} {len(rows[is_keyframe])}: vertex colours {a:.2f} dB, texture {b:.2f} dB ({b - a:+.2f}); "
                 f"covered {100 * seen:.1f} / {100 * seen_textured:.1f} %"
             )
+    keyframes = np.flatnonzero(trajectory.is_keyframe)
+    shares = []
+    for row in keyframes[np.linspace(0, len(keyframes) - 1, 5).astype(int)]:
+        shares.append([holes(drawer.draw(trajectory.cam_from_world[row], camera)[1]) for drawer in drawers])
+    print("  holes, % of all vertices / textured: " + ", ".join(f"{100 * a:.2f} / {100 * b:.2f}" for a, b in shares))
     if picture is not None:
         picked = np.linspace(0, len(sheets) - 1, min(len(sheets), 5)).astype(int)
         write_rgb(picture, np.concatenate([sheets[i] for i in picked]))
+
+
+def holes(covered: NDArray) -> float:
+    """The share of the silhouette (H, W) that shows the background: slits, and what the mesh encloses."""
+    ball = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (11, 11))
+    padded = np.pad(covered.astype(np.uint8), 8, mode="edge")
+    near = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, ball)[8:-8, 8:-8] > 0
+    silhouette = binary_fill_holes(near | covered)
+    return float((silhouette & ~covered).sum() / max(silhouette.sum(), 1))
 
 
 class Drawer:
@@ -113,12 +129,13 @@ class VertexColours(Drawer):
 
 
 class Textured(Drawer):
-    """As trimesh reads it from the OBJ."""
+    """As trimesh reads it from the GLB."""
 
-    def __init__(self, path: Path, picture: Path) -> None:
+    def __init__(self, path: Path, gltf_from_world: NDArray) -> None:
         mesh = trimesh.load(path, process=False, force="mesh")
-        super().__init__(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-        self.uv, self.picture = np.asarray(mesh.visual.uv), read_rgb(picture)
+        super().__init__(np.asarray(mesh.vertices) @ gltf_from_world, np.asarray(mesh.faces))
+        self.uv = np.asarray(mesh.visual.uv)
+        self.picture = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))
         self.count = len(np.unique(self.vertices, axis=0))
 
     def colors_at(self, face: NDArray, shares: NDArray) -> NDArray:
