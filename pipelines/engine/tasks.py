@@ -28,7 +28,6 @@ from ..config import STAGES, Config
 from ..run.folder import RunFolder
 from ..run.lock import take_lock
 from ..system.identity import stage_file, stage_identity
-from ..system.memory import keep_free_memory
 from ..system.progress import Progress
 from ..system.stopping import stop_if_asked
 from ..system.values import load_value, name_of, of_name, save_value
@@ -297,7 +296,7 @@ def code_identity() -> str:
 
 
 def set_threads(threads: int) -> None:
-    """Let the libraries of this process use so many CPU threads, and keep the memory that they free."""
+    """Let the libraries of this process use so many CPU threads."""
     import cv2
     import scipy.linalg  # noqa: F401 (loads a BLAS of its own, whose threads are limited below)
     import torch
@@ -311,4 +310,3 @@ def set_threads(threads: int) -> None:
     # Of numpy's and scipy's BLAS: on more its sums are others, and on the small matrices here they wait for each other
     # longer than they work, on a busy machine twenty times as long. Threads of ours call it side by side.
     threadpool_limits(1, "blas")
-    keep_free_memory()

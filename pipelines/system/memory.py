@@ -29,10 +29,6 @@ LEAST_SUBMAP = 60
 ALIGNED_TOGETHER = 200
 """Fields of depths that are solved for at once: their equations take 0.4 MB each."""
 _UNKNOWN_MACHINE = 8_000_000_000
-_MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
-"""Numbers of glibc's malloc.h."""
-_LARGE_PIECE, _KEPT_FREE = 1 << 26, 1 << 27
-"""Bytes from which a piece is handed back as soon as it is freed, and that are kept at the end of the heap."""
 
 
 def submap_size(config: Config, camera: Intrinsics) -> int:
@@ -46,17 +42,6 @@ def submap_size(config: Config, camera: Intrinsics) -> int:
     pixels = small.width * small.height / 1e6
     room = (1 - VIEWS_SHARE) * memory_mb - least - a_million_pixels * camera.width * camera.height / 1e6
     return min(most, max(LEAST_SUBMAP, int(room / (a_million_gaussians * GAUSSIANS / 1e6 * pixels))))
-
-
-def keep_free_memory() -> None:
-    """Let the C library, where that is glibc, keep what is freed for the next who asks, instead of handing it back.
-
-    A visit of mapping frees and takes anew 25 MB: 6,000 page faults and a twentieth of its time. Stages hand back what
-    is left by `release_free_memory`.
-    """
-    if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
-        mallopt(_MMAP_THRESHOLD, _LARGE_PIECE)
-        mallopt(_TRIM_THRESHOLD, _KEPT_FREE)
 
 
 def release_free_memory() -> None:

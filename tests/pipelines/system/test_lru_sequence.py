@@ -121,28 +121,6 @@ def test_the_peak_of_memory_is_that_of_a_stage() -> None:
     assert after < with_block - 200
 
 
-FAULTS = """
-import resource, sys
-import numpy as np
-from msgs_slam.pipelines.system.memory import keep_free_memory
-if sys.argv[1] == "kept":
-    keep_free_memory()
-for _ in range(30):
-    held = [np.ones(750_000) for _ in range(6)]
-    del held
-print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
-"""
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only glibc is told to")
-def test_memory_that_is_freed_and_taken_again_is_not_taken_from_the_system() -> None:
-    counts = {
-        how: int(subprocess.run([sys.executable, "-c", FAULTS, how], capture_output=True, check=True).stdout)
-        for how in ("kept", "left")
-    }
-    assert 1000 < counts["kept"] < counts["left"] / 3
-
-
 @pytest.fixture
 def cgroups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Sets the cgroups of this process: the lines of /proc/self/cgroup, and files below /sys/fs/cgroup."""
