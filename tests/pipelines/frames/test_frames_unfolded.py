@@ -1,8 +1,11 @@
 """Things that repeat fold a path; what neighbours share unfolds it."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pycolmap
+import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import FramesConfig
@@ -63,8 +66,20 @@ def no_picture(frame_id: int) -> Picture:
     raise AssertionError(f"nobody needs the picture of frame {frame_id}")
 
 
-def test_sides_that_look_alike_do_not_fold_the_path(tmp_path: Path) -> None:
+def _counting(mapping: Any, tracks: list[int]) -> Any:
+    """The mapper, which notes how many tracks of a view it asks for."""
+
+    def counted(database: Path, images: Path, out: Path, options: pycolmap.GlobalPipelineOptions) -> Any:
+        tracks.append(options.mapper.track_required_tracks_per_view)
+        return mapping(database, images, out, options)
+
+    return counted
+
+
+def test_sides_that_look_alike_do_not_fold_the_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     centers, features, seen = round_room()
+    tracks: list[int] = []
+    monkeypatch.setattr(pycolmap, "global_mapping", _counting(pycolmap.global_mapping, tracks))
     pairs = matched(features, seen)
     assert sum(p.second - p.first > VIEWS // SIDES - 1 for p in pairs) > 50
     structure = StructureFromMotion(
@@ -79,6 +94,7 @@ def test_sides_that_look_alike_do_not_fold_the_path(tmp_path: Path) -> None:
     assert folded is not None
     assert found is not None
     assert folded[2].contradicted
+    assert tracks == [150, 300]  # of a view: a chain of neighbours drifts by 3 m on 150 in a corridor, not in this room
     model, mapper, report = found
     assert mapper == "neighbours-closed"
     assert not report.contradicted
