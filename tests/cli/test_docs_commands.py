@@ -12,7 +12,7 @@ from cli_runs import FinishedRun, invoke
 from msgs_slam.pipelines.viewer.camera_path import CameraPath, Keyframe
 
 TOUR = Path(__file__).resolve().parents[2] / "docs" / "tour.md"
-MADE_ELSEWHERE = {"reconstruct", "demo", "view", "doctor", "models"}
+MADE_ELSEWHERE = {"reconstruct", "resume", "demo", "view", "doctor", "models"}
 
 
 def test_the_tour_can_be_followed(finished_run: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

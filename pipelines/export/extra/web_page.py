@@ -20,6 +20,7 @@ from ....formats.gaussians import GaussianCloud
 from ....formats.sog import morton_order
 from ...geometry.rig import rig_of
 from ...outcome import Outcome, evenly, map_cloud
+from ...run.folder import RunFolder
 from ...scene.world import Z_UP_FROM_Y_DOWN, World
 from ...types import VOID
 
@@ -43,7 +44,7 @@ def write_web_page(outcome: Outcome, world: World, folder: Path) -> list[Path]:
     upright = np.eye(3) if world.axes == "up" else Z_UP_FROM_Y_DOWN
     about, packed = pack_cloud(cloud, upright)
     about |= _classes(cloud, outcome) | _cameras(outcome, upright) | _unit(outcome, world)
-    write_text(folder / WEB_PAGE, _page(outcome.run.root.stem, about, packed))
+    write_text(folder / WEB_PAGE, _page(_title(outcome.run), about, packed))
     return [folder / WEB_PAGE]
 
 
@@ -127,6 +128,12 @@ def _unit(outcome: Outcome, world: World) -> dict[str, Any]:
         text = f"{metres.text[0].upper()}{metres.text[1:]}."
         unit |= {"per_unit": metres.per_unit, "relative_sd": metres.relative_sd, "text": text}
     return {"unit": unit, "floor": world.has_floor}
+
+
+def _title(run: RunFolder) -> str:
+    """The source's name: that of the run's folder would give two runs of one source other bytes."""
+    manifest = run.manifest()
+    return run.root.stem if manifest is None else Path(manifest.source.path).stem
 
 
 def _page(title: str, about: dict[str, Any], packed: bytes) -> str:

@@ -92,7 +92,7 @@ def test_workers_leave_the_same_export(
         files = {p.name: p.read_bytes() for p in sorted(alike.folder.iterdir()) if p.is_file()}
         made.append((figures, files))
     assert made[0] == made[1]
-    assert workers.done == {"draw_keyframes": 6, "snap_views": 6, "fuse_views": 3}
+    assert workers.done == {"draw_keyframes": 6, "snap_views": 6, "fuse_views": 4}
 
 
 def exported_from_run(run: RunFolder) -> Similarity:
@@ -121,7 +121,8 @@ def test_the_mesh_is_the_room(finished: tuple[RunFolder, dict, dict]) -> None:
     assert set(np.unique(labels)) <= {*range(len(run.load(CLASSES))), VOID}
     assert (labels != VOID).mean() > 0.9
     glb = trimesh.load(run.stage("export") / "mesh.glb", force="mesh")
-    assert len(glb.faces) == len(mesh.faces)
+    assert 1000 < len(glb.faces) < len(mesh.faces)  # flat places need few under a texture
+    assert np.sort(glb.extents) == pytest.approx(np.sort(mesh.extents), rel=0.05)
     # Every triangulated point is exact and lies on a surface that two keyframes see.
     points = exported_from_run(run).apply(run.load(SPARSE, "tracking").points_in_world[::9])
     distance = np.linalg.norm(points[:, None] - np.asarray(mesh.vertices)[None], axis=2).min(1)
