@@ -13,16 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.pipelines.evaluation.views import label_picture, render_outcome
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import WORLD
-from tests.benchmarks.textured_mesh import VertexColours
+from tests.benchmarks.textured_mesh import Textured
 
 WIDTH = 400
 """Pixels of one of the four."""
-_LIGHT = np.array([0.4, -0.5, 0.77])
 
 
 def main() -> None:
@@ -48,21 +46,14 @@ def drawn(outcome: Outcome, row: int) -> dict[str, NDArray[np.uint8]]:
     cam_from_world = outcome.trajectory.cam_from_world[row]
     view = render_outcome(outcome, cam_from_world)
     world = WORLD.read(outcome.run.file("export", "world.json"))
-    mesh = read_mesh_ply(outcome.run.file("export", "mesh.ply"))
-    corners = mesh.vertices[mesh.faces].astype(np.float64)
-    normals = np.zeros_like(mesh.vertices, dtype=np.float64)
-    for k in range(3):
-        np.add.at(normals, mesh.faces[:, k], np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    light = (150 + 90 * normals @ _LIGHT)[:, None].clip(40, 250)
-    shaded = (light * np.array([0.98, 0.97, 0.94])).astype(np.uint8)
+    mesh = Textured(outcome.run.file("export", "mesh.glb"), world.gltf_from_exported)
     moved = outcome.moved(world.exported_from_run).trajectory.cam_from_world[row]
-    color, covered = VertexColours(mesh.vertices, mesh.faces, shaded).draw(moved, outcome.calibration.intrinsics)
+    color, covered = mesh.draw(moved, outcome.calibration.intrinsics)
     surface = np.where(covered[..., None], np.round(255 * color.clip(0, 1)), 255).astype(np.uint8)
     return {
         "Gaussian map": view.exposed(outcome.exposure, outcome.frames[row].timestamp),
         "classes": label_picture(view.labels, outcome.classes.colors),
-        "mesh": surface,
+        "textured mesh": surface,
     }
 
 
