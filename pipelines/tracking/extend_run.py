@@ -59,6 +59,11 @@ def require_extendable(run: RunFolder, videos: Sequence[Path], config: Config, p
             f"{run.root} was made from panoramas, and only a run of ordinary videos can be extended: reconstruct "
             "all the recordings together, in a new run"
         )
+    if config.run.method == "paper":
+        raise InputError(
+            f"{run.root} was made with --method paper, which poses frames in their order and grows no finished map: "
+            "reconstruct all the videos together, in a new run"
+        )
     require_listable(videos)
     width, height = _size(video_files(source)[0])
     for video in videos:

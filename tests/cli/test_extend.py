@@ -187,6 +187,7 @@ REFUSED = {
     "without a map": "mapping is not done. Run `msgs-slam resume",
     "damaged": "mapping is not done. Run `msgs-slam resume",
     "images": "Reconstruct all of it into another folder, with --poses",
+    "the paper's": "was made with --method paper",
 }
 
 
@@ -216,6 +217,8 @@ def test_what_does_not_fit_is_refused_and_nothing_is_changed(
     elif what == "without a map":
         begun = {name: manifest.records[name] for name in ("frames", "proxy", "tracking")}
         write_manifest(run.manifest_file, replace(manifest, records=begun))
+    elif what == "the paper's":
+        run.settings_file.write_text(run.settings_file.read_text().replace('method = "default"', 'method = "paper"'))
     elif what == "damaged":
         (run.root / "mapping" / next(iter(manifest.records["mapping"].files))).unlink()
     before = files_below(run.root)
