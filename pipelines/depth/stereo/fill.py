@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...system.jit import kernel
-from .upsample import upsample_depth
 
 _FAINT, _POWER = 5e-5, 0.25
 """Variance (intensities 0..1; two grey levels) and power by which agreement on a blank surface counts less."""
@@ -90,16 +89,10 @@ def fill_unsure(
         return depth, np.minimum(confidence, SURE)
     weight = np.where(depth > 0, confidence, 0).astype(np.float64) ** _EVIDENCE_POWER
     inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0)
-    # Planes are smooth: at half the size they are the same at a fourth of the time.
-    size = -(-depth.shape[1] // 2), -(-depth.shape[0] // 2)
-    half, both = (cv2.resize(a, size, interpolation=cv2.INTER_AREA) for a in (weight, weight * inverse))
-    small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    mean = np.zeros(half.shape)
-    np.divide(both, half, out=mean, where=half > 0)
-    guess, mass = _local_planes(mean, np.asarray(half, np.float64), small)
+    guess, mass = _local_planes(inverse, weight, image)
+    filled = np.where(sure, depth, 1 / guess)
     trust = np.maximum(_FLAT_CONFIDENCE * mass / (mass + _KNOWN_MASS), _GUESS_CONFIDENCE)
-    filled = upsample_depth((1 / guess).astype(np.float32), trust.astype(np.float32), image)
-    return np.where(sure, depth, filled.depth), np.where(sure, confidence, filled.confidence)
+    return filled.astype(np.float32), np.where(sure, confidence, trust).astype(np.float32)
 
 
 def _local_planes(inverse: Array, weight: Array, image: NDArray[np.uint8]) -> tuple[Array, Array]:
