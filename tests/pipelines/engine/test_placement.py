@@ -74,10 +74,14 @@ def test_a_signal_ends_the_processes(somewhere: Placement, tmp_path: Path) -> No
         os.kill(os.getpid(), signal.SIGINT)
 
     thread = threading.Thread(target=interrupt)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     thread.start()
     started = time.monotonic()
-    with pytest.raises(Stopped), soft_stop(lambda number: None):
-        list(somewhere.run([command("waits", "wait", marker), command("raises", "fail", 1)]))
+    try:
+        with pytest.raises(Stopped), soft_stop(lambda number: None):
+            list(somewhere.run([command("waits", "wait", marker), command("raises", "fail", 1)]))
+    finally:
+        signal.signal(signal.SIGINT, before)
     thread.join()
     assert time.monotonic() - started < 25
     require_gone(int(marker.read_text()))
