@@ -127,7 +127,7 @@ def _open_placement(name: str, address: str, threads: int) -> tuple[LocalPlaceme
 
 def _print(rows: list[dict[str, object]]) -> None:
     from ..pipelines.system.wording import figure_text
-    from .tables import format_table, terminal_width
+    from .output import format_table, terminal_width
 
     columns = list(dict.fromkeys(key for row in rows for key in row))
     cells = [[figure_text(row[c]) if c in row else "" for c in columns] for row in rows]

@@ -20,7 +20,7 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
     """Say which stages of RUN are done, what they found, what was degraded, and which files are damaged."""
     from ..pipelines.reconstruct import all_stages
     from ..pipelines.status import run_status
-    from .tables import scale_lines, status_table, warning_lines
+    from .output import scale_lines, status_table, warning_lines
 
     run = open_run(run_path)
     found = run_status(run, all_stages)

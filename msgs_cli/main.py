@@ -34,8 +34,18 @@ from .options import (
     settings_options,
     source_options,
 )
-from .output import Output, flush_output, on_sigterm, prepare_streams, printable, program, say, verbosity_options
-from .tables import print_summary, tell_run
+from .output import (
+    Output,
+    flush_output,
+    on_sigterm,
+    prepare_streams,
+    print_summary,
+    printable,
+    program,
+    say,
+    tell_run,
+    verbosity_options,
+)
 
 
 class FriendlyGroup(click.Group):

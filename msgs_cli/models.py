@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ..pipelines.system.wording import BAD, Finding
-from .output import say
-from .tables import format_table, terminal_width
+from .output import format_table, say, terminal_width
 
 if TYPE_CHECKING:
     from ..pipelines.networks.registry import Model, ModelStore

@@ -1,4 +1,4 @@
-"""Output of a command: logs, progress, its result and how it ends, as text or as JSON lines."""
+"""Output of a command: logs, progress, tables, its result and how it ends, as text or as JSON lines."""
 
 from __future__ import annotations
 
@@ -8,20 +8,52 @@ import shlex
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from ..pipelines.system.progress import (
+    BEGUN,
+    ENDED,
+    UP_TO_DATE,
+    LineProgress,
+    Progress,
+    SilentProgress,
+    StageEvent,
+    is_asked,
+    let_libraries_take_signals,
+    log,
+    soft_stop,
+)  # fmt: skip
+from ..pipelines.system.wording import figure_text
 from .json_lines import JsonHandler, JsonProgress, write_line
 
 if TYPE_CHECKING:
-    from ..pipelines.system.progress import Progress
+    from tqdm import tqdm
 
+    from ..pipelines.run.manifest import StageRecord
+    from ..pipelines.status import StageStatus
+
+KEY_FIGURES = {
+    "frames": ("frames", "keyframes_placed", "calibration", "focal_px", "focal_sd_px", "gps"),
+    "proxy": ("depth", "semantics", "metric", "metres_per_unit", "classes"),
+    "tracking": ("posed", "keyframes", "lost", "scale"),
+    "mapping": ("gaussians", "keyframe_psnr"),
+    "global_ba": ("loops", "images_posed", "keyframe_psnr"),
+    "export": ("images", "vertices", "faces", "up", "floor", "gps"),
+}
+"""What a person wants to know first; `status -v` says all."""
+
+T = TypeVar("T")
+_BAR = "{desc} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+_WIDTH = 32
+"""Of what is before the bar."""
 _STOPPING = (
     "Stopping at the next snapshot. Press Ctrl-C again to stop now (what was done since the last snapshot is lost)."
 )
@@ -65,9 +97,6 @@ class Output:
 
     def progress(self, job: str = "") -> Progress:
         """Bars on a terminal, a line a stage in a file or pipe, JSON lines, or nothing; of a `job` among others."""
-        from ..pipelines.system.progress import LineProgress, SilentProgress
-        from .progress import BarProgress
-
         if self.quiet:
             return SilentProgress()
         if self.as_json:
@@ -82,8 +111,6 @@ class Output:
 
     def task_progress(self, name: str) -> Progress:
         """Set logging up anew for a named task of many; returns its progress, lines rather than bars."""
-        from ..pipelines.system.progress import LineProgress, log
-
         self.set_up_logging()
         if not self.quiet and not self.as_json:
             return LineProgress(name)
@@ -108,8 +135,6 @@ class Output:
         """End the work in this block at its next snapshot on the first SIGINT, SIGTERM or SIGHUP, at once on the
         second; then the process ends with 128 plus the signal's number, as shells expect. Says `how_to_go_on`, and
         nothing where that is empty: the process that started this one does."""
-        from ..pipelines.system.stopping import soft_stop
-
         try:
             with soft_stop(self._tell_stopping if how_to_go_on else lambda number: None):
                 yield
@@ -153,8 +178,6 @@ def is_said(warning: str) -> bool:
 def on_sigterm(handler: Any) -> Iterator[None]:
     """Handle SIGTERM (docker stop, systemd) otherwise inside this block. SIG_DFL ends the process at once, without a
     library's stack trace; `signal.default_int_handler` raises KeyboardInterrupt, as Ctrl-C does."""
-    from ..pipelines.system.stopping import let_libraries_take_signals
-
     let_libraries_take_signals()
     before = signal.signal(signal.SIGTERM, handler)
     try:
@@ -212,3 +235,119 @@ def flush_output() -> None:
         # Python tries again when it ends, and would complain a second time.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise
+
+
+class BarProgress:
+    """Bars with the stage, counts, the time left of each and, at its end, of the whole job."""
+
+    def __init__(self) -> None:
+        self._event: StageEvent | None = None
+
+    def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+        """Yield the items and show how many are done. A bar that ends early is full, for nothing is left to do, but for
+        one that a signal ends."""
+        from tqdm import tqdm
+
+        title = f"{self._event.title} " if self._event else ""
+        with tqdm(total=total, desc=f"{title}{label}".ljust(_WIDTH), mininterval=0.2, dynamic_ncols=True,
+                  bar_format=_BAR) as bar:  # fmt: skip
+            try:
+                for item in items:
+                    yield item
+                    self._show_left(bar)
+                    bar.update()
+            finally:
+                if not is_asked():
+                    bar.total = bar.n
+                bar.refresh()
+
+    def _show_left(self, bar: tqdm) -> None:
+        if self._event is not None:
+            bar.set_postfix_str(self._event.left_text.removeprefix("; ").replace("left", "to the end"), refresh=False)
+
+    def stage(self, event: StageEvent) -> None:
+        """Say which stage begins, and how long one that has ended took."""
+        from tqdm import tqdm
+
+        self._event = event if event.state == BEGUN else None
+        if event.state == ENDED:
+            tqdm.write(f"{event.title} done in {event.seconds:.0f} s{event.left_text}", file=sys.stderr)
+        elif event.state == UP_TO_DATE:
+            tqdm.write(f"{event.title} up to date", file=sys.stderr)
+
+
+def format_table(header: Sequence[str], rows: Sequence[Sequence[str]], width: int = 0) -> str:
+    """Left-aligned columns under a rule; the last one is wrapped to a table of `width` characters, 0 = as it is."""
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    before = sum(widths[:-1]) + 2 * (len(widths) - 1)
+    if width:
+        widths[-1] = min(widths[-1], max(width - before, 20))
+    lines = []
+    for row in [header, *rows]:
+        start = "".join(cell.ljust(w + 2) for cell, w in zip(row[:-1], widths[:-1], strict=True))
+        last = textwrap.wrap(row[-1], widths[-1]) if width else [row[-1]]
+        lines += [(start + (last[0] if last else "")).rstrip(), *(" " * before + more for more in last[1:])]
+    return "\n".join([lines[0], "  ".join("-" * w for w in widths), *lines[1:]])
+
+
+def terminal_width() -> int:
+    """Characters a line of the terminal, 0 where the output goes into a file or pipe."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
+
+
+def status_table(stages: Sequence[StageStatus], everything: bool = False) -> str:
+    """One row a stage: state, seconds, peak memory, key figures or all of them."""
+    rows = []
+    for stage in stages:
+        expected = "" if stage.expected_mb is None else f"{stage.expected_mb:.0f}"
+        if (record := stage.record) is None:
+            rows.append([stage.name, stage.state_text, "", "", expected, ""])
+            continue
+        wanted = record.figures if everything else [k for k in KEY_FIGURES[stage.name] if k in record.figures]
+        figures = ", ".join(f"{key} {figure_text(record.figures[key], key)}" for key in wanted)
+        rows.append(
+            [stage.name, stage.state, f"{record.seconds:.1f}", f"{record.peak_memory_mb:.0f}", expected, figures]
+        )
+    header = ["stage", "state", "seconds", "peak MB", "expected MB", "figures"]
+    shown = [n for n in range(len(header)) if n != 4 or (everything and any(row[n] for row in rows))]
+    return format_table([header[n] for n in shown], [[row[n] for n in shown] for row in rows], terminal_width())
+
+
+def scale_lines(root: Path, records: dict[str, StageRecord]) -> list[str]:
+    """Return the line about the scale of the world; none before the export has estimated it."""
+    from ..pipelines.run.files import METRES
+    from ..pipelines.run.folder import RunFolder
+
+    metres = RunFolder(root).find(METRES) if "export" in records else None
+    return [] if metres is None else [f"\nScale: {metres.text}"]
+
+
+def warning_lines(records: dict[str, StageRecord], is_said: Callable[[str], bool] = lambda text: False) -> list[str]:
+    """Every degraded result, by stage, that is not said yet."""
+    return [f"warning ({n}): {text}" for n, record in records.items() for text in record.warnings if not is_said(text)]
+
+
+def tell_run(output: Output, root: Path, records: dict[str, Any]) -> None:
+    """Say how the run is now, for people unless they want errors only, and for programs."""
+    if not output.quiet:
+        print_summary(root, records)
+    output.tell_result(run=root, **({"export": root / "export"} if "export" in records else {}))
+
+
+def print_summary(root: Path, records: dict[str, Any]) -> None:
+    """Print the table, what is not said yet, and where the results are."""
+    from ..pipelines.reconstruct import all_stages
+    from ..pipelines.run.folder import RunFolder
+    from ..pipelines.status import DONE, StageStatus, about_new_networks
+
+    say(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
+    for line in warning_lines(records, is_said):
+        say(line, err=True)
+    for line in scale_lines(root, records):
+        say(line)
+    if line := about_new_networks(RunFolder(root), all_stages):
+        say(f"\n{line}")
+    if "export" in records:
+        say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
+        if (page := root / "export" / "map.html").exists():
+            say(f"Open in a browser: {page}")

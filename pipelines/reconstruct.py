@@ -15,14 +15,12 @@ from .engine.stages import Stage, TaskWorkers
 from .engine.tasks import BETWEEN_LOOKS, Shard, SharedWorkers, boards_in, set_threads
 from .read_config import with_absolute_paths
 from .run.folder import RunFolder, load_records, load_settings, load_source
-from .run.lock import LEADER, LOCK, RunBusyError, locked, make_folder
+from .run.lock import LEADER, LOCK, NotedProgress, RunBusyError, locked, make_folder
 from .run.manifest import StageRecord, recorded_config
-from .run.running import NotedProgress
 from .source.opening import source_digest
 from .system.device import resolve_device
 from .system.memory import available_cpus
-from .system.progress import Progress, log
-from .system.stopping import stop_if_asked
+from .system.progress import Progress, log, stop_if_asked
 from .system.wording import quoted
 
 

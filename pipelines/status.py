@@ -16,10 +16,9 @@ from .networks.registry import ModelStore, metric_card
 from .proxy.selection import choose_depth, choose_semantics
 from .run.files import CALIBRATION
 from .run.folder import RunFolder, load_records, load_settings, load_source
+from .run.lock import Running, load_running
 from .run.manifest import StageRecord, differing_settings
-from .run.running import Running, load_running
-from .sfm.window_size import window_size, windows_of
-from .system.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size
+from .system.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size, window_size, windows_of
 from .system.wording import quoted
 
 _BEYOND = 0.3

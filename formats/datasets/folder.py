@@ -10,7 +10,6 @@ from ..image_folder import count_images, list_images
 from ..textfile import read_rows
 from ..trajectory import read_matrices, read_tum
 from .calibration import read_intrinsics_json
-from .classes import read_classes_json
 from .matching import (
     classes_found,
     files_for_images,
@@ -18,7 +17,7 @@ from .matching import (
     poses_for_images,
     times_or_frame_numbers,
 )
-from .sequence import Camera, LabelClass, Sequence
+from .sequence import Camera, LabelClass, Sequence, read_classes_json
 
 _IMAGE_FOLDERS = ("rgb", "images", "color", "frames")
 _DEPTH_FOLDERS = ("depth", "depths")

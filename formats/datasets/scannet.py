@@ -15,9 +15,8 @@ from ..images import MAX_IMAGE_PIXELS, decode_rgb, first_readable, image_size
 from ..reading import opened, require_file
 from ..textfile import read_table
 from ..trajectory import clean_poses, read_matrices
-from .classes import find_label_table, read_nyu40_classes
 from .matching import ASSUMED_RATE, classes_found, files_for_images, times_or_frame_numbers
-from .sequence import Camera, LabelClass, Sequence
+from .sequence import Camera, LabelClass, Sequence, find_label_table, read_nyu40_classes
 
 _VERSION = 4
 _JPEG, _PNG = 2, 1

@@ -22,8 +22,7 @@ from pathlib import Path
 from typing import IO, Any, Protocol, TypeVar
 
 from ...formats.errors import InputError, RecoverableError, install_command
-from ..system.progress import Progress, log
-from ..system.stopping import SIGNALS, Stopped, is_asked, stop_if_asked
+from ..system.progress import SIGNALS, Progress, Stopped, is_asked, log, stop_if_asked
 from ..system.wording import quoted
 from .tasks import TaskBoard, code_identity, require_same_world
 

@@ -18,8 +18,7 @@ from ..run.ending import FINGERPRINT, empty, find_sealed, move_in, results, seal
 from ..run.folder import RunFolder, load_records, save_settings
 from ..run.manifest import Manifest, Source, StageRecord, content_digest, plain, settings_of, write_manifest
 from ..system.memory import release_free_memory
-from ..system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log
-from ..system.stopping import stop_if_asked
+from ..system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log, stop_if_asked
 from ..system.wording import quoted
 from .stages import SameSource, Stage, StageContext, TaskWorkers, stopping_after_writes, trust_source
 from .staleness import (

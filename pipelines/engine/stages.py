@@ -14,8 +14,7 @@ from ..run.ending import SNAPSHOT
 from ..run.folder import RunFolder
 from ..system.device import resolve_device
 from ..system.memory import available_cpus, memory_room, release_free_memory
-from ..system.progress import Progress, log
-from ..system.stopping import stop_if_asked
+from ..system.progress import Progress, log, stop_if_asked
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -28,8 +28,7 @@ from ..config import STAGES, Config
 from ..run.folder import RunFolder
 from ..run.lock import take_lock
 from ..system.identity import stage_file, stage_identity
-from ..system.progress import Progress
-from ..system.stopping import stop_if_asked
+from ..system.progress import Progress, stop_if_asked
 from ..system.values import load_value, name_of, of_name, save_value
 from .stages import StageContext, stopping_after_writes
 

@@ -15,7 +15,7 @@ from ..geometry import se3
 from ..mapping.load import split_frames
 from ..outcome import Outcome, evenly
 from ..render.api import Rendering, render
-from ..source.source_pixels import FramePixels
+from ..sfm.lens import FramePixels
 from ..system.progress import Progress, SilentProgress
 from ..types import Trajectory
 from .image_quality import DepthErrorSum, open_lpips, psnr, ssim

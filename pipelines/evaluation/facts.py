@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..export.stage import on_earth
-from ..geometry.rig import rig_of
+from ..geometry.camera import rig_of
 from ..geometry.sparse_model import SparseModel
 from ..geometry.tape import tape_text
 from ..outcome import Outcome

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ...formats.datasets import Sequence
 from ...formats.textfile import read_rows
 from ...formats.trajectory import read_matrices
-from ..source.originals import written_name
+from ..source.recording import written_name
 from ..types import Frame
 from .trajectory_error import associate
 

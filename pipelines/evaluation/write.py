@@ -11,7 +11,7 @@ from ...formats.textfile import write_json
 from ..geometry.se3 import Similarity, align_points
 from ..outcome import Outcome, evenly, load_outcome
 from ..run.folder import RunFolder
-from ..source.source_pixels import FramePixels
+from ..sfm.lens import FramePixels
 from ..system.progress import Progress
 from ..system.wording import markdown_table
 from .evaluate import evaluate_outcome

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from ...formats.atomic import copy_file, write_text
 from ...formats.colmap import ColmapModel, write_colmap_model
 from ...formats.datasets.nerfstudio import write_transforms
-from ...formats.gaussian_glb import write_gaussian_glb
 from ...formats.gaussians import GaussianCloud
 from ...formats.ply import write_gaussian_ply, write_point_ply
 from ...formats.sog import write_sog
+from ...formats.splats import write_gaussian_glb
 from ...formats.spz import write_spz
 from ...formats.trajectory import write_tum
 from ..config import ExportConfig
-from ..geometry.rig import rig_of
+from ..geometry.camera import rig_of
 from ..geometry.sparse_model import SparseModel
 from ..outcome import Outcome, map_cloud
 from ..run.files import CLASSES, LEFT_OUT, METRES

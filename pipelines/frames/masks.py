@@ -14,7 +14,7 @@ from ...formats.image_folder import frame_number, natural_key
 from ...formats.images import image_size, read_rgb
 from ...formats.reading import files_sha256
 from ..config import Config
-from ..geometry.rig import ONE_CAMERA, Rig
+from ..geometry.camera import ONE_CAMERA, Rig
 from ..masks.people import PeopleCards, PeopleFinder, people_cards
 from ..networks.registry import ModelStore
 from ..run.files import LEFT_OUT

@@ -19,7 +19,7 @@ from ...formats.video import VideoFrame
 from ..config import Config
 from ..engine.stages import Stage, StageContext
 from ..engine.tasks import in_chunks
-from ..geometry.rig import Rig, rig_of
+from ..geometry.camera import Rig, rig_of
 from ..run.extension import parent_inputs, parent_of
 from ..run.files import (
     BACKBONE,
@@ -32,21 +32,19 @@ from ..run.files import (
     save_frames,
 )
 from ..run.folder import RunFolder, load_records
-from ..sfm.backbone import to_sparse_model
 from ..sfm.bridges import Picture
-from ..sfm.calibration import intrinsics_inputs, read_intrinsics
 from ..sfm.driver import Structure
 from ..sfm.lens import Lens, distortion_of, make_lens
 from ..sfm.parallax import require_motion
 from ..sfm.rolling import read_readout, straight_copy
-from ..sfm.window_size import window_size, windows_of
 from ..source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
-from ..source.known_poses import check_poses, given_poses, pose_inputs
+from ..source.given import check_poses, given_poses, intrinsics_inputs, pose_inputs, read_intrinsics
 from ..source.opening import FolderSource, Source, Warn, open_source
 from ..source.sharpness import reduce_image
+from ..system.memory import window_size, windows_of
 from ..system.parallel import parallel_map
 from ..types import Calibration, Frame, GivenPoses
-from .findings import in_world_of, settled_origin, warn_of_focal, warn_of_given, warn_of_structure
+from .findings import in_world_of, settled_origin, to_sparse_model, warn_of_focal, warn_of_given, warn_of_structure
 from .keyframes import KeyframeChoice, choose_keyframes, pick_frames
 from .learned import learned_inputs, open_learned
 from .masks import FrameMasks, check_masks, mask_inputs

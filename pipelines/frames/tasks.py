@@ -11,21 +11,20 @@ from ...formats.datasets.sequence import Camera
 from ...formats.images import read_rgb
 from ..engine.stages import StageContext
 from ..engine.tasks import Chunk
-from ..geometry.rig import Rig, rig_of
+from ..geometry.camera import Rig, rig_of
 from ..run.extension import parent_of
 from ..sfm.bridges import Picture
-from ..sfm.calibration import read_intrinsics
 from ..sfm.driver import Divide, StructureFromMotion, when_asked
 from ..sfm.features import to_grey
 from ..sfm.lens import FOCAL_GUESS, calibrated_camera, to_pycolmap, unknown_camera
 from ..sfm.matching import match_features
 from ..sfm.snapshots import Snapshots
-from ..sfm.window_size import window_size
 from ..source.faces import Faces, find_faces
-from ..source.known_poses import given_poses
+from ..source.given import given_poses, read_intrinsics
 from ..source.opening import FolderSource, VideoSource, open_source
 from ..source.recording import RecordingSource
 from ..source.sharpness import reduced_size
+from ..system.memory import window_size
 from ..system.progress import Progress
 from ..types import Features, Frame, GivenPoses
 from .learned import open_learned, picture_features

@@ -16,18 +16,17 @@ from ..config import FramesConfig
 from ..engine.stages import StageContext
 from ..frames.learned import picture_features
 from ..geometry import se3
-from ..geometry.rig import Rig, rig_of
+from ..geometry.camera import Rig, rig_of
 from ..geometry.sparse_model import SparseModel
 from ..mapping.move_map import follow_keyframes
 from ..run.files import CALIBRATION, EVERY_FRAME, FEATURES, FRAMES
 from ..run.folder import RunFolder
-from ..sfm.lens import make_lens, to_pycolmap
+from ..sfm.lens import distorted_camera, make_lens, to_pycolmap
 from ..sfm.rolling import Shutter, velocities
 from ..source.faces import find_faces
 from ..source.opening import Source, open_source
 from ..source.sharpness import reduce_image
-from ..source.source_pixels import distorted_camera
-from ..system.stopping import is_asked
+from ..system.progress import is_asked
 from ..system.values import load_value, save_value
 from ..system.wording import stretches
 from ..tracking.adjust import settle

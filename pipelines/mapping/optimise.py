@@ -17,8 +17,7 @@ from ..render.api import Rendering, in_view, marked_in_view, render
 from ..render.gaussian_map import GaussianMap
 from ..render.inspection import blending_weights, class_weights
 from ..system.parallel import LruSequence, abreast
-from ..system.progress import Progress, SilentProgress
-from ..system.stopping import is_asked
+from ..system.progress import Progress, SilentProgress, is_asked
 from .exposure import SOLID, expose, fit_exposure
 from .growth import HIGH_RELIABILITY, LOW_RELIABILITY, DensificationError, Growth, densification_error
 from .objective import Objective, color_errors_on_card, fit_exposure_on_card

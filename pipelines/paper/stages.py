@@ -34,7 +34,7 @@ from ..run.files import (
     SPARSE,
     TRAJECTORY,
 )
-from ..system.stopping import is_asked
+from ..system.progress import is_asked
 from ..system.wording import stretches
 from ..types import LoopEdge, Trajectory
 from .adjustment import Adjustment, adjust, pose_graph

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...formats.datasets import Sequence as Recording
 from ...formats.errors import InputError
 from ..providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider, Sequence, class_colors
-from ..source.source_pixels import FramePixels
+from ..sfm.lens import FramePixels
 from ..system.progress import Progress
 from ..types import VOID, ClassTable, Frame
 

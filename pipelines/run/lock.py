@@ -1,4 +1,7 @@
-"""One process at a time works on a run: it holds a lock or, on a disk without locks, a file that it keeps touching."""
+"""One process at a time works on a run: it holds a lock or, on a disk without locks, a file that it keeps touching.
+How far it is stands in a small file for other processes to read."""
+
+from __future__ import annotations
 
 import _thread
 import fcntl
@@ -9,22 +12,29 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sized
 from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, TypeVar
 
 from ...formats.atomic import machine_mark, process_mark
 from ...formats.errors import InputError, RecoverableError
-from ..system.progress import log
+from ...formats.textfile import read_json
+from ..system.progress import BEGUN, Progress, StageEvent, about, log
 from .folder import RunFolder, load_records
+from .schema import dataclass_from_json
 
+T = TypeVar("T")
 LOCK, LEADER = ".lock", ".leader"
 _LOOKS, _A_MOMENT = 3, 0.05
 """How often a lock that is held is tried again, and the seconds between."""
 BEAT, SILENT = 15.0, 180.0
 """Seconds between two signs of life of the leader on a disk without locks, and without one after which it is taken for
 dead: network disks show a file's time up to a minute late."""
+PROGRESS = ".progress.json"
+_BETWEEN_WRITES = 2.0
+"""Seconds between two notes of progress."""
 
 
 class RunBusyError(InputError):
@@ -239,3 +249,73 @@ def _beat(path: Path, mine: bytes, ended: threading.Event) -> None:
             return
         with suppress(OSError):
             os.utime(path)
+
+
+@dataclass(frozen=True)
+class Running:
+    """The stage that is being made; of the piece of work that it is at how much is `done`, of how many (0: unknown);
+    left: seconds to the end of all stages, 0 where nothing is known."""
+
+    stage: str
+    label: str = ""
+    done: int = 0
+    of: int = 0
+    left: float = 0.0
+
+    @property
+    def text(self) -> str:
+        """running, features 57 %, about 4 min left"""
+        share = f", {self.label} {100 * self.done // self.of} %" if self.of else ""
+        return f"running{share}" + (f", {about(self.left)} left" if self.left else "")
+
+
+class NotedProgress:
+    """Shows what another one shows, and notes it in the run while a stage is being made, seldom enough to cost nothing.
+    The file goes with the block."""
+
+    def __init__(self, progress: Progress, run: RunFolder) -> None:
+        self._progress, self._file = progress, run.root / PROGRESS
+        self._event: StageEvent | None = None
+        self._written = 0.0
+
+    def __enter__(self) -> NotedProgress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(OSError):
+            self._file.unlink(missing_ok=True)
+
+    def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+        """Yield the items, and write how many are done to the file every so often."""
+        of = total or (len(items) if isinstance(items, Sized) else 0)
+        for done, item in enumerate(self._progress.track(items, label, total)):
+            if time.monotonic() - self._written > _BETWEEN_WRITES:
+                self._note(label, done, of)
+            yield item
+
+    def stage(self, event: StageEvent) -> None:
+        """Attribute what is tracked from now on to this stage."""
+        self._progress.stage(event)
+        self._event = event if event.state == BEGUN else self._event
+        if event.state == BEGUN:
+            self._note()
+
+    def _note(self, label: str = "", done: int = 0, of: int = 0) -> None:
+        if self._event is None:
+            return
+        self._written = time.monotonic()
+        now = Running(self._event.name, label, done, of, float(self._event.left() or 0.0))
+        temporary = self._file.with_suffix(".tmp")
+        with suppress(OSError):  # who works must not stop for who watches
+            temporary.write_text(json.dumps(asdict(now)), encoding="utf-8")
+            os.replace(temporary, self._file)
+
+
+def load_running(run: RunFolder) -> Running | None:
+    """Load the progress of the process at work; None where there is none, or no stage has started."""
+    path = Path(run.root / PROGRESS)
+    if not path.exists() or not is_led(run):
+        return None
+    with suppress(InputError, ValueError):
+        return dataclass_from_json(Running, read_json(path))
+    return None

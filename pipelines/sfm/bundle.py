@@ -17,8 +17,7 @@ from scipy.sparse import bsr_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
 from ..geometry import se3
-from ..geometry.camera import project
-from ..geometry.rig import ONE_CAMERA, Rig, tie_cameras
+from ..geometry.camera import ONE_CAMERA, Rig, project, tie_cameras
 from ..types import Intrinsics, require_shape
 from . import bundle_kernels as kernels
 

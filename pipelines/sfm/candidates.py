@@ -17,7 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from ..config import FramesConfig
-from ..geometry.rig import ONE_CAMERA
+from ..geometry.camera import ONE_CAMERA
 from ..system.parallel import LruSequence
 from ..system.progress import Progress
 from ..types import Features

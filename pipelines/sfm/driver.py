@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ...formats.textfile import read_json, write_json
-from ..system.memory import release_free_memory
+from ..system.memory import WINDOW, release_free_memory, windows_of
 from ..system.parallel import LruSequence, parallel_map
 from ..system.progress import log
 from ..types import Features, Vocabulary
@@ -36,7 +36,6 @@ from .retrieval import (
 from .rolling import NO_READOUT, Readout, adjust_rolling, read_readout
 from .seams import cut, remove_keyframes
 from .snapshots import Snapshots, features_name, pairs_name
-from .window_size import SIZE, windows_of
 from .windows import WindowModels, adjust_joined
 
 _PAIRS_PER_BLOCK = 64
@@ -83,7 +82,7 @@ class StructureFromMotion(Candidates):
     match: Callable[[Features, Features], NDArray[np.uint32]]
     threads: int
     memory: float = math.inf
-    window: int = SIZE
+    window: int = WINDOW
     divide: Divide = when_asked
     given: NDArray[np.float64] | None = None
     warn: Callable[[str], None] = log.warning

@@ -15,10 +15,10 @@ from ...formats.datasets.sequence import Camera
 from ...formats.errors import InputError
 from ...formats.video_streams import PART, WHOLE, image_sphere, video_sphere
 from ..config import FramesConfig
-from ..geometry.rig import CUBE, LEVEL
-from ..sfm.calibration import read_intrinsics
+from ..geometry.camera import CUBE, LEVEL
 from ..sfm.lens import make_lens, to_pycolmap
 from ..types import Intrinsics
+from .given import read_intrinsics
 from .opening import FolderSource, VideoSource
 from .recording import RecordingSource
 from .sharpness import reduced_size

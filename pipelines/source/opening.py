@@ -17,8 +17,7 @@ from ...formats.reading import file_sha256, files_sha256, opened, reaching, requ
 from ...formats.textfile import read_text
 from ...formats.video import VideoFrame, VideoReader, probe_video
 from .one_camera import Headers, common_span, read_headers, require_one_lens
-from .originals import reusable, written_names
-from .recording import RecordingSource, open_recording
+from .recording import RecordingSource, open_recording, reusable, written_names
 
 Warn = Callable[[str], None]
 LIST_SUFFIX = ".videos"

@@ -18,8 +18,8 @@ from ..run.extension import FINAL, save_parent
 from ..run.files import CALIBRATION, SPARSE
 from ..run.folder import RunFolder, load_records, load_source
 from ..run.manifest import Manifest, Source, write_manifest
-from ..sfm.calibration import read_intrinsics
 from ..sfm.lens import Lens, calibrated_camera, make_lens, to_pycolmap
+from ..source.given import read_intrinsics
 from ..source.opening import VideoSource, open_source, source_digest, video_files
 from ..source.recording import RecordingSource
 from ..source.sharpness import reduce_image

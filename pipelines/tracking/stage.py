@@ -4,7 +4,7 @@ from typing import Any
 
 from ...formats.errors import InputError
 from ..engine.stages import Stage, StageContext
-from ..geometry.rig import Rig, rig_of
+from ..geometry.camera import Rig, rig_of
 from ..run.files import (
     BACKBONE,
     CALIBRATION,
@@ -17,14 +17,13 @@ from ..run.files import (
 )
 from ..sfm.rolling import Shutter
 from ..system.memory import release_free_memory
-from ..system.stopping import is_asked
+from ..system.progress import is_asked
 from ..system.values import load_value, save_value
 from ..system.wording import stretches
 from ..types import Frame
 from .adjust import Report, adjust_state, align_depths, without_dependent_depth
-from .front_end import FrontEnd
+from .front_end import FrontEnd, set_rotation_only_poses
 from .pictures import Pictures, load_shutter
-from .rotation_only import set_rotation_only_poses
 from .segments import carry_given, join_segments, split_segments
 from .state import FEATURE_SD, TrackState, split_worlds, sync_rig_poses, to_sparse_model, to_trajectory
 

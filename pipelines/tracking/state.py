@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..geometry import se3
-from ..geometry.rig import ONE_CAMERA, Rig
+from ..geometry.camera import ONE_CAMERA, Rig
 from ..geometry.sparse_model import SparseModel
 from ..sfm.rolling import Shutter, velocities
 from ..types import Frame, Trajectory

@@ -11,8 +11,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from ...formats.errors import InputError, install_command
-from ...formats.gaussian_files import read_gaussians
 from ...formats.images import write_rgb
+from ...formats.splats import read_gaussians
 from ...formats.video_writer import CODECS, PLAYED, write_browser_video, write_video
 from ..evaluation.views import (
     Picture,

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...formats.errors import InputError
-from ...formats.gaussian_files import read_gaussians
 from ...formats.gaussians import GaussianCloud, isotropic_cloud
 from ...formats.reading import reaching
+from ...formats.splats import read_gaussians
 from ..export.stage import on_earth
 from ..geometry.sparse_model import SparseModel
 from ..outcome import Outcome, evenly, labels_of_channels, load_outcome, map_cloud

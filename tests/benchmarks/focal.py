@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from tracking import in_process
 
 from msgs_slam.pipelines.config import FramesConfig
-from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
+from msgs_slam.pipelines.geometry.camera import ONE_CAMERA
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.sfm.candidates import Adjusted, Candidates, Views
 from msgs_slam.pipelines.sfm.lens import unknown_camera

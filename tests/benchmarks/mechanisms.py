@@ -31,7 +31,7 @@ from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames import stage as frames_stage
 from msgs_slam.pipelines.frames import tasks
 from msgs_slam.pipelines.frames.keyframes import pick_frames
-from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
+from msgs_slam.pipelines.geometry.camera import ONE_CAMERA
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.sfm import candidates

@@ -49,7 +49,7 @@ from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import FIRST, WORLD
-from msgs_slam.pipelines.source.source_pixels import FramePixels
+from msgs_slam.pipelines.sfm.lens import FramePixels
 from msgs_slam.pipelines.types import VOID, ClassTable
 from tests.network_labels import network_labels
 

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.rig import CUBE, rig_of
+from msgs_slam.pipelines.geometry.camera import CUBE, rig_of
 from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import CALIBRATION, TRAJECTORY

@@ -41,7 +41,7 @@ from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import CALIBRATION, FRAMES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.source.source_pixels import FramePixels
+from msgs_slam.pipelines.sfm.lens import FramePixels
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Intrinsics
 

@@ -36,7 +36,7 @@ from msgs_slam.pipelines.geometry.camera import resample_nearest
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import CALIBRATION, FRAMES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.source.source_pixels import FramePixels
+from msgs_slam.pipelines.sfm.lens import FramePixels
 from msgs_slam.pipelines.types import Frame
 
 BINS = (0.0, 0.05, 0.15, 0.3, 0.5, 0.8, 1.01)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from cli_runs import invoke
 
-from msgs_slam.msgs_cli.tables import format_table
+from msgs_slam.msgs_cli.output import format_table
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
 from msgs_slam.pipelines.system.wording import figure_text, lost_text, stretches
 

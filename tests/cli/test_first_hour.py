@@ -149,7 +149,7 @@ def test_signals_end_other_commands_without_a_stack_trace(
 
 
 def test_status_tells_how_long_the_unit_is_and_gps() -> None:
-    from msgs_slam.msgs_cli.tables import KEY_FIGURES
+    from msgs_slam.msgs_cli.output import KEY_FIGURES
 
     assert "metres_per_unit" in KEY_FIGURES["proxy"]
     assert "gps" in KEY_FIGURES["frames"]

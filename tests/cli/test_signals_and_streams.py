@@ -17,7 +17,7 @@ from msgs_slam.pipelines.engine import runner
 from msgs_slam.pipelines.engine.runner import forget_peak, peak_memory_mb
 from msgs_slam.pipelines.run import folder
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system.stopping import Stopped, is_asked, soft_stop, stop_if_asked
+from msgs_slam.pipelines.system.progress import Stopped, is_asked, soft_stop, stop_if_asked
 
 COMMAND = [sys.executable, "-m", "msgs_slam"]
 

@@ -30,10 +30,8 @@ from tokenizers import models as tokenizer_models
 from msgs_slam.formats.colmap import read_colmap_model, write_colmap_model
 from msgs_slam.formats.datasets import Camera, Sequence, open_sequence, recognise_source
 from msgs_slam.formats.datasets.calibration import read_intrinsics_json
-from msgs_slam.formats.datasets.classes import read_classes_json, read_nyu40_classes
+from msgs_slam.formats.datasets.sequence import read_classes_json, read_nyu40_classes
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussian_files import read_gaussians
-from msgs_slam.formats.gaussian_glb import write_gaussian_glb
 from msgs_slam.formats.gaussians import GaussianCloud
 from msgs_slam.formats.image_folder import (
     list_images,  # fmt: skip
@@ -52,6 +50,7 @@ from msgs_slam.formats.images import (
 )
 from msgs_slam.formats.mesh import MeshArrays, MeshBlocks, read_mesh_ply, write_mesh_ply
 from msgs_slam.formats.ply import write_gaussian_ply
+from msgs_slam.formats.splats import read_gaussians, write_gaussian_glb
 from msgs_slam.formats.spz import write_spz
 from msgs_slam.formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
 from msgs_slam.formats.textfile import read_toml, write_json
@@ -66,7 +65,7 @@ from msgs_slam.pipelines.networks.network_pass import ResultCache
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.networks.words import load_linear_head, load_word_head, open_tokenizer, with_words
-from msgs_slam.pipelines.sfm.calibration import read_intrinsics
+from msgs_slam.pipelines.source.given import read_intrinsics
 from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.viewer.scene import load_scenes
 from tests.colmap_models import posed_images

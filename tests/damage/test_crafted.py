@@ -23,9 +23,9 @@ from PIL import Image
 from msgs_slam.formats.colmap import read_colmap_model
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussian_files import read_gaussians
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.formats.splats import read_gaussians
 from msgs_slam.formats.tensors import load_arrays, load_tensors
 from msgs_slam.formats.textfile import read_json, read_toml
 from msgs_slam.formats.trajectory import read_matrices, read_tum

@@ -12,15 +12,15 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussian_files import read_gaussians
-from msgs_slam.formats.gaussian_glb import (
+from msgs_slam.formats.gaussians import GaussianCloud
+from msgs_slam.formats.splats import (
     COMPRESSION,
     EXTENSION,
     read_gaussian_glb,
+    read_gaussians,
     write_compressed_glb,
     write_gaussian_glb,
 )
-from msgs_slam.formats.gaussians import GaussianCloud
 
 
 def _cloud(m: int = 301) -> GaussianCloud:

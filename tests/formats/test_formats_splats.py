@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from msgs_slam.formats.datasets import Camera, open_sequence
 from msgs_slam.formats.datasets.nerfstudio import write_transforms
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussian_files import read_gaussians, read_splat
 from msgs_slam.formats.gaussians import GaussianCloud
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.ply import read_gaussian_ply, write_gaussian_ply
+from msgs_slam.formats.splats import read_gaussians, read_splat
 from msgs_slam.formats.spz import read_spz, write_spz
 
 

@@ -22,7 +22,7 @@ def die(marker: str, times: str) -> None:
 def wait(marker: str) -> None:
     """Until stopped, or until the process that started this one is gone."""
     from msgs_slam.pipelines.engine.placement import stop_with_parent
-    from msgs_slam.pipelines.system.stopping import soft_stop, stop_if_asked
+    from msgs_slam.pipelines.system.progress import soft_stop, stop_if_asked
 
     stop_with_parent()
     with soft_stop(lambda number: None):

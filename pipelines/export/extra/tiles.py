@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....formats.atomic import require_room
-from ....formats.gaussian_glb import COMPRESSION, EXTENSION, write_compressed_glb
 from ....formats.gaussians import GaussianCloud, isotropic_cloud
 from ....formats.gps import ecef_from_enu
+from ....formats.splats import COMPRESSION, EXTENSION, write_compressed_glb
 from ....formats.textfile import write_json
 from ...outcome import Outcome
 from ...run.ending import empty

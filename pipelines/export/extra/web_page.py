@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ....formats.atomic import require_room, write_text
 from ....formats.gaussians import GaussianCloud
 from ....formats.sog import morton_order
-from ...geometry.rig import rig_of
+from ...geometry.camera import rig_of
 from ...outcome import Outcome, evenly, map_cloud
 from ...run.folder import RunFolder
 from ...scene.world import Z_UP_FROM_Y_DOWN, World

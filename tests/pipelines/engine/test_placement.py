@@ -24,7 +24,7 @@ from msgs_slam.pipelines.engine.placement import ClusterWorkers, Command, LocalP
 from msgs_slam.pipelines.engine.tasks import Shard, boards_in
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system import values
-from msgs_slam.pipelines.system.stopping import Stopped, soft_stop
+from msgs_slam.pipelines.system.progress import Stopped, soft_stop
 
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra msgs-slam[cluster]")
 

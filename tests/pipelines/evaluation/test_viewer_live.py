@@ -17,8 +17,7 @@ from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.files import BACKBONE, FRAMES, MAP, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import locked
-from msgs_slam.pipelines.run.running import NotedProgress
+from msgs_slam.pipelines.run.lock import NotedProgress, locked
 from msgs_slam.pipelines.system.progress import BEGUN, SilentProgress, StageEvent
 from msgs_slam.pipelines.viewer import live
 from msgs_slam.pipelines.viewer.live import standing

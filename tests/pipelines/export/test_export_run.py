@@ -14,7 +14,7 @@ from evo.tools import file_interface
 
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussian_glb import read_gaussian_glb
+from msgs_slam.formats.splats import read_gaussian_glb
 from msgs_slam.formats.spz import read_spz
 from msgs_slam.pipelines.config import EXPORTS, ExportConfig
 from msgs_slam.pipelines.export.extra import texture as textured

@@ -14,8 +14,8 @@ import torch
 
 from msgs_slam.formats import atomic
 from msgs_slam.formats.errors import DiskFullError
-from msgs_slam.formats.gaussian_glb import read_gaussian_glb
 from msgs_slam.formats.gaussians import GaussianCloud
+from msgs_slam.formats.splats import read_gaussian_glb
 from msgs_slam.pipelines.export.extra import tiles
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.outcome import load_outcome

@@ -14,8 +14,8 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config, FramesConfig
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import STAGE, run
-from msgs_slam.pipelines.sfm.calibration import read_intrinsics
 from msgs_slam.pipelines.sfm.lens import distortion_of, make_lens, set_lens, to_pycolmap, unknown_camera
+from msgs_slam.pipelines.source.given import read_intrinsics
 from msgs_slam.pipelines.source.opening import FolderSource
 from tests.pipelines.frames.conftest import Walk
 

@@ -16,7 +16,7 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.video_streams import PART, WHOLE, image_sphere, video_sphere
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.frames.stage import check
-from msgs_slam.pipelines.geometry.rig import CUBE, ONE_CAMERA, Rig, rig_of
+from msgs_slam.pipelines.geometry.camera import CUBE, ONE_CAMERA, Rig, rig_of
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.source.faces import find_faces, fisheye_face, looks_like_panoramas, panorama_faces
 from msgs_slam.pipelines.source.opening import open_source

@@ -17,7 +17,7 @@ from msgs_slam.pipelines.sfm.candidates import GIVEN, _worth
 from msgs_slam.pipelines.sfm.consistency import ModelReport
 from msgs_slam.pipelines.sfm.given import agreement, posed_model
 from msgs_slam.pipelines.sfm.lens import to_pycolmap, unknown_camera
-from msgs_slam.pipelines.source.known_poses import given_poses
+from msgs_slam.pipelines.source.given import given_poses
 from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.types import Frame, GivenPoses
 from tests.pipelines.frames.made_views import structure_of, walk_round

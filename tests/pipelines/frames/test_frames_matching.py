@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 
 from msgs_slam.pipelines.frames.keyframes import choose_keyframes
-from msgs_slam.pipelines.geometry.rig import ONE_CAMERA
+from msgs_slam.pipelines.geometry.camera import ONE_CAMERA
 from msgs_slam.pipelines.sfm import matching, retrieval
 from msgs_slam.pipelines.sfm.consistency import epipolar_error, judge, without_misplaced
 from msgs_slam.pipelines.sfm.features import extract_features

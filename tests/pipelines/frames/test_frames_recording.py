@@ -27,10 +27,9 @@ from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.sfm.lens import distortion_of, make_lens, to_pycolmap
+from msgs_slam.pipelines.sfm.lens import FramePixels, distortion_of, make_lens, to_pycolmap
 from msgs_slam.pipelines.source.opening import FolderSource, open_source
 from msgs_slam.pipelines.source.recording import RecordingSource
-from msgs_slam.pipelines.source.source_pixels import FramePixels
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics
 from tests.pipelines.part_of_sequence import part_of

@@ -23,8 +23,8 @@ from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.schema import dataclass_from_json
 from msgs_slam.pipelines.sfm import driver as sfm
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
-from msgs_slam.pipelines.sfm.window_size import windows_of
 from msgs_slam.pipelines.source.opening import source_digest
+from msgs_slam.pipelines.system.memory import windows_of
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration
 from tests.pipelines.frames.conftest import QUICK, WALK_FRAMES, Walk, render, sideways, turn, write_walk

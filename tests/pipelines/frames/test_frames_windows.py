@@ -23,8 +23,8 @@ from msgs_slam.pipelines.sfm.lens import unknown_camera
 from msgs_slam.pipelines.sfm.matching import VerifiedPair
 from msgs_slam.pipelines.sfm.rolling import NO_READOUT
 from msgs_slam.pipelines.sfm.scale_repair import mended, resize_behind, size_ratio
-from msgs_slam.pipelines.sfm.window_size import SHARED, SIZE, window_size, windows_of
 from msgs_slam.pipelines.sfm.windows import WIDE, Joined, adjust_together, close_loops
+from msgs_slam.pipelines.system.memory import WINDOW, WINDOW_OVERLAP, window_size, windows_of
 from msgs_slam.pipelines.types import Calibration, Intrinsics
 from tests.world.paths import look_at
 
@@ -79,17 +79,17 @@ def moves() -> list[Similarity]:
 
 
 def test_windows_hold_all_keyframes_and_share_some() -> None:
-    assert windows_of(int(1.5 * SIZE)) == [range(int(1.5 * SIZE))]
+    assert windows_of(int(1.5 * WINDOW)) == [range(int(1.5 * WINDOW))]
     for count in (751, 1000, 2000, 5601):
         windows = windows_of(count)
         assert windows[0].start == 0
         assert windows[-1].stop == count
-        assert all(SIZE / 2 < len(w) <= 1.5 * SIZE for w in windows)
-        assert all(a.stop - b.start == SHARED for a, b in pairwise(windows))
+        assert all(WINDOW / 2 < len(w) <= 1.5 * WINDOW for w in windows)
+        assert all(a.stop - b.start == WINDOW_OVERLAP for a, b in pairwise(windows))
 
 
 def test_the_memory_that_is_given_decides_how_large_windows_are() -> None:
-    assert window_size(0, 27648) == window_size(4000, 27648) == SIZE  # a machine's own memory decides nothing
+    assert window_size(0, 27648) == window_size(4000, 27648) == WINDOW  # a machine's own memory decides nothing
     assert [window_size(m, 27648) for m in (100, 700, 1000)] == [100, 177, 354]
     assert window_size(1000, 307200) < 354  # of larger pictures
     assert all(len(w) <= 1.5 * 177 for w in windows_of(2272, window_size(700, 27648)))

@@ -27,7 +27,7 @@ from msgs_slam.pipelines.outcome import load_outcome, maps_around
 from msgs_slam.pipelines.run.files import DEPTH_FIELDS, MAP, SUBMAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.schema import RunFile
-from msgs_slam.pipelines.system.memory import LEAST_SUBMAP, submap_size
+from msgs_slam.pipelines.system.memory import MIN_SUBMAP, submap_size
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Intrinsics
 
@@ -65,8 +65,8 @@ def test_submaps_are_as_large_as_the_memory_that_is_given_allows() -> None:
         return submap_size(Config(run=RunConfig(memory_mb=memory_mb), mapping=MappingConfig(submap=most)), camera)
 
     assert size(0) == 250  # the same on every machine
-    assert LEAST_SUBMAP < size(2000) < size(3000) < 250
-    assert (size(100), size(100_000), size(100, most=0), size(100, most=20)) == (LEAST_SUBMAP, 250, 0, 20)
+    assert MIN_SUBMAP < size(2000) < size(3000) < 250
+    assert (size(100), size(100_000), size(100, most=0), size(100, most=20)) == (MIN_SUBMAP, 250, 0, 20)
 
 
 def test_what_is_seen_again_stays_together() -> None:

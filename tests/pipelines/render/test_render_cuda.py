@@ -14,7 +14,7 @@ from render_scenes import IMAGES, NAMES, random_gaussians, room  # noqa: E402
 
 from msgs_slam.pipelines.compute import gpu  # noqa: E402
 from msgs_slam.pipelines.geometry import se3  # noqa: E402
-from msgs_slam.pipelines.render import cuda, cuda_projection, cuda_tiles, reference  # noqa: E402
+from msgs_slam.pipelines.render import cuda, cuda_projection, reference  # noqa: E402
 from msgs_slam.pipelines.render.api import composite, in_view, render  # noqa: E402
 from msgs_slam.pipelines.render.inspection import error_shares  # noqa: E402
 from tests.card_builds import build  # noqa: E402
@@ -117,7 +117,7 @@ def test_what_projects_and_lists_compiles_for_cards(tmp_path):
     numbers |= dict.fromkeys(("fx", "fy", "cx", "cy", "focal", "near"), "fp32")
     kernels = {
         "render.cuda_projection": ["project_rows", "record_rows", "mark_rows", "back_project_rows"],
-        "render.cuda_tiles": ["count_tiles", "list_pairs", "order_members"],
+        "render.cuda": ["count_tiles", "list_pairs", "order_members"],
         "render.cuda_kernels": ["divide_pixels", "divide_back_pixels"],
     }
     build(kernels, constants, {**long, **numbers, "marks": "*u8"}, tmp_path)
@@ -151,7 +151,7 @@ def test_lists_are_sorted_by_tile_then_depth_then_index():
     geometry = [scene[name].to(DEVICE) for name in ("u", "v", "sigma_px", "z", "opacity")]
     geometry[3] = (geometry[3] * 2).round() - 3
     records = cuda_projection.record(tuple(geometry), *SIZE, -10.0)
-    starts, members = cuda_tiles.list_tiles(records, *SIZE)
+    starts, members = cuda.list_tiles(records, *SIZE)
     u, v, _, z, _, reach = records.cpu().unbind(1)
     across, tile = -(-SIZE[0] // 16), 0
     for tile in range(len(starts) - 1):

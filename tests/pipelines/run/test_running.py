@@ -11,10 +11,9 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines import reconstruct
 from msgs_slam.pipelines.config import STAGES, Config
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
-from msgs_slam.pipelines.run import ending, running
+from msgs_slam.pipelines.run import ending, lock
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import is_led, locked
-from msgs_slam.pipelines.run.running import FILE, Running, load_running
+from msgs_slam.pipelines.run.lock import PROGRESS, Running, is_led, load_running, locked
 from msgs_slam.pipelines.status import run_status
 from msgs_slam.pipelines.system.progress import SilentProgress
 
@@ -50,7 +49,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> States:
         right(folder)
 
     monkeypatch.setattr(ending, "_flush_folder", flush)
-    monkeypatch.setattr(running, "_BETWEEN_WRITES", 0.0)
+    monkeypatch.setattr(lock, "_BETWEEN_WRITES", 0.0)
     monkeypatch.setattr(reconstruct, "all_stages", lambda method: [Stage(name, run) for name in STAGES])
     return found
 
@@ -64,19 +63,19 @@ def test_the_stage_that_a_process_is_at_runs(seen: States, source: Path, tmp_pat
     assert renamed[2].startswith("running")
     assert set(at_half[3:]) == set(renamed[3:]) == {"not yet"}
     assert {s.state for s in run_status(run).stages} == {"done"}
-    assert not (run.root / FILE).exists()
+    assert not (run.root / PROGRESS).exists()
 
 
 def test_what_a_killed_process_has_noted_does_not_run(seen: States, source: Path, tmp_path: Path) -> None:
     run = RunFolder(tmp_path / "run.msgs")
     reconstruct.reconstruct(source, run, Config(), SilentProgress(), until="frames")
     run.partial("proxy").mkdir()
-    (run.root / FILE).write_text('{"stage": "proxy", "label": "depth", "done": 3, "of": 4, "left": 240.0}')
+    (run.root / PROGRESS).write_text('{"stage": "proxy", "label": "depth", "done": 3, "of": 4, "left": 240.0}')
     assert [s.state_text for s in run_status(run).stages[:2]] == ["done", "interrupted"]
     with locked(run):
         assert load_running(run) == Running("proxy", "depth", 3, 4, 240.0)
         assert run_status(run).stages[1].state_text == "running, depth 75 %, about 4 min left"
-        (run.root / FILE).write_text("{")
+        (run.root / PROGRESS).write_text("{")
         assert run_status(run).stages[1].state == "interrupted"
     assert not is_led(run)
     shutil.rmtree(run.root)

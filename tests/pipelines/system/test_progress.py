@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from msgs_slam.msgs_cli.progress import BarProgress
+from msgs_slam.msgs_cli.output import BarProgress
 from msgs_slam.pipelines.config import Config, RunConfig
 from msgs_slam.pipelines.engine.time_left import USUAL, TimeLeft, Work, machine_speed, work_of
 from msgs_slam.pipelines.read_config import load_config

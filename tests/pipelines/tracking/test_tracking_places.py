@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.rig import CUBE, Rig, rig_of, tie_cameras
+from msgs_slam.pipelines.geometry.camera import CUBE, Rig, rig_of, tie_cameras
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.sfm.bundle import Bundle, adjust_bundle
 from msgs_slam.pipelines.tracking.segments import split_segments

@@ -11,8 +11,8 @@ from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.run.files import TRAJECTORY
+from msgs_slam.pipelines.tracking.front_end import fit_rotation, turn_between
 from msgs_slam.pipelines.tracking.pictures import Pictures
-from msgs_slam.pipelines.tracking.rotation_only import fit_rotation, turn_between
 from msgs_slam.pipelines.tracking.stage import STAGE
 from msgs_slam.pipelines.types import Intrinsics, Trajectory
 from tests.pipelines.tracking.conftest import MadeRun

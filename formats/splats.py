@@ -1,4 +1,4 @@
-"""Gaussians in a GLB by glTF's extension KHR_gaussian_splatting (Khronos, ratified).
+"""Splat files of any program, by suffix; and Gaussians in a GLB by glTF's extension KHR_gaussian_splatting (Khronos).
 
 A primitive of points whose attributes are POSITION and, prefixed with the extension's name, ROTATION (x y z w), SCALE
 (standard deviations), OPACITY (0..1) and SH_DEGREE_0_COEF_0 (colour = 0.5 + 0.2821 * it). COLOR_0 is for programs that
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from .errors import InputError
 from .gaussians import GaussianCloud, unit_quaternions
 from .glb import FLOAT, UNLIT, WIDTHS, Part, glb_parts, linear, material, write_glb, write_primitive
-from .ply import SH_C0
+from .ply import SH_C0, read_gaussian_ply
 from .reading import parsing, read_bytes
-from .spz import read_spz_stream, spz_bytes
+from .spz import read_spz, read_spz_stream, spz_bytes
 
 EXTENSION = "KHR_gaussian_splatting"
 COMPRESSION = "KHR_gaussian_splatting_compression_spz_2"
@@ -27,6 +27,8 @@ _LABEL = "_LABEL"
 # glTF's y is up and its z comes towards the viewer; splats have x right, y down, z forward.
 _FLIP = np.array([1, -1, -1], dtype=np.float32)
 _MIN_OPACITY = 1e-4
+_SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
+_SMALLEST_SCALE = 1e-9
 
 
 def write_gaussian_glb(path: Path, cloud: GaussianCloud, class_names: tuple[str, ...] = ()) -> None:
@@ -131,4 +133,45 @@ def _cloud(arrays: dict[str, NDArray[np.float32]]) -> GaussianCloud:
         opacity_logits=np.log(opacity / (1 - opacity)).astype(np.float32),
         colors=arrays[f"{EXTENSION}:SH_DEGREE_0_COEF_0"] * np.float32(SH_C0) + np.float32(0.5),
         class_ids=arrays[_LABEL][:, 0].astype(np.uint8) if _LABEL in arrays else None,
+    )
+
+
+def read_gaussians(path: Path) -> GaussianCloud:
+    """Read the Gaussians of a .ply, .spz, .splat or .glb file, by its suffix.
+
+    Raises InputError for another suffix, a missing or damaged file, and values that are not finite.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind == ".ply":
+        return read_gaussian_ply(path)
+    if kind == ".spz":
+        return read_spz(path)
+    if kind == ".splat":
+        return read_splat(path)
+    if kind == ".glb":
+        return read_gaussian_glb(path)
+    raise InputError(f"{path} has an unsupported extension; expected .ply, .spz, .splat or .glb")
+
+
+def read_splat(path: Path) -> GaussianCloud:
+    """Read the Gaussians of a .splat file: 32 bytes each, without header, 8 bit colours and rotations.
+
+    Raises InputError when the file is missing, its length is no multiple of 32, or a value is not finite.
+    """
+    data = read_bytes(path)
+    if len(data) % _SPLAT_ROW.itemsize:
+        raise InputError(f"{path} is no whole .splat file (32 bytes for each Gaussian): copy or export it again")
+    with parsing(path, ".splat file"):
+        return _read_rows(np.frombuffer(data, dtype=_SPLAT_ROW))
+
+
+def _read_rows(rows: NDArray) -> GaussianCloud:
+    opacity = (rows["rgba"][:, 3] / 255.0).clip(1e-4, 1 - 1e-4)
+    return GaussianCloud(
+        means=rows["mean"].astype(np.float32),
+        log_scales=np.log(np.maximum(rows["scale"], _SMALLEST_SCALE)).astype(np.float32),
+        quat_wxyz=unit_quaternions(rows["quat_wxyz"] / 128.0 - 1),
+        opacity_logits=np.log(opacity / (1 - opacity)).astype(np.float32),
+        colors=(rows["rgba"][:, :3] / 255.0).astype(np.float32),
     )
