@@ -290,7 +290,8 @@ class Metres:
     deviation (that of the logarithm).
 
     is_guess: whether it rests only on what is usual in the world; sources: its evidence, strongest first; alone: the
-    estimate of each; disagreement: the Birge ratio of the sources, over 1 where they scatter more than they should.
+    estimate of each; disagreement: the Birge ratio of the sources, over 1 where they scatter more than they should;
+    only_in_room: whether it holds for a room alone, and nothing tells that the scene is one.
     """
 
     per_unit: float
@@ -299,6 +300,7 @@ class Metres:
     sources: tuple[str, ...]
     alone: tuple[MetresSource, ...] = ()
     disagreement: float = 1.0
+    only_in_room: bool = False
 
     def __post_init__(self) -> None:
         if not (self.per_unit > 0 and self.relative_sd > 0):
@@ -309,6 +311,7 @@ class Metres:
         """1 unit = about 0.83 m ± 18 % (estimated from floor height and 2 doors)."""
         *first, last = self.sources or ("nothing in particular",)
         told = f"{', '.join(first)} and {last}" if first else last
+        told += ", if the scene is a room" if self.only_in_room else ""
         about, guess = ("about ", "estimated ") if self.is_guess else ("", "")
         percent = 100 * self.relative_sd
         spread = f"{percent:.0f}" if percent >= 2 else f"{percent:.1f}"

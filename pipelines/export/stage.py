@@ -85,7 +85,7 @@ def metres_figures(metres: Metres | None) -> dict[str, Any]:
         "metres_per_unit": round(metres.per_unit, 4),
         "metres_relative_sd": round(metres.relative_sd, 4),
         "metres_are": "estimated" if metres.is_guess else "given",
-        "metres_from": ", ".join(metres.sources),
+        "metres_from": ", ".join([*metres.sources, *["if the scene is a room"] * metres.only_in_room]),
         "metres_disagreement": round(metres.disagreement, 2),
     }
 

@@ -68,6 +68,8 @@ THINGS = ("door", "level surface", *dict.fromkeys(told for told, _ in TOPS.value
 """Sources that are counted: 2 doors, 3 chairs."""
 DOORS = ("door", "double door")
 FLOORS = ("floor", "rug", "carpet", "road", "earth", "ground")
+CEILING_HEIGHT = "ceiling"
+"""The kind of evidence that only a room gives."""
 FURNITURE = (*TOPS, "cabinet", "shelf", "storage", "wardrobe")
 """What a plane that is taken for the floor must not mostly be called."""
 OUTDOORS = (

@@ -12,6 +12,7 @@ from ..labels.named import disputed
 from .evidence import (
     CAMERA_OVER_FLOOR,
     CAMERA_OVER_TABLE,
+    CEILING_HEIGHT,
     CEILING_OVER_FLOOR,
     DISTANCE,
     DOOR,
@@ -125,7 +126,9 @@ def ceiling_height(scene: Scene) -> list[Evidence]:
     height = float((ceiling.point - floor.point) @ floor.normal)
     if height <= 0:
         return []
-    return [measured("ceiling height", "ceiling", height, CEILING_OVER_FLOOR, wrong=max(wrong, 0.1), length_sd=0.02)]
+    return [
+        measured("ceiling height", CEILING_HEIGHT, height, CEILING_OVER_FLOOR, wrong=max(wrong, 0.1), length_sd=0.02)
+    ]
 
 
 def usual_distance(scene: Scene) -> Evidence:

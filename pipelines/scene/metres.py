@@ -2,7 +2,7 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from ..networks.card import Card
 from ..run.files import CALIBRATION, CLASSES, DEPTH_FIELDS, FIGURES, FRAME_SCALES, FRAMES, PROXY_MAPS
 from ..run.folder import RunFolder
 from ..types import Intrinsics, Metres, MetresSource, Trajectory
-from .evidence import OUTDOORS, THINGS, Combined, Evidence, combine, independence
+from .evidence import CEILING_HEIGHT, OUTDOORS, THINGS, Combined, Evidence, combine, independence
 from .heights import camera_height, ceiling_height, sizes_of_things, usual_distance
 from .network import MEASURED, known_scale, network_scale
 from .view import Scene, SeenFrame, build_scene
@@ -63,7 +63,20 @@ def find_metres(
             "the scene is outdoors by its labels (sky, grass, road), so its size in metres is not estimated: what the "
             "estimate knows are rooms. Give --scale-ref, or a GPS track with --gps"
         )
-    return describe(pieces) if pieces else None, warning
+    metres = describe(pieces) if pieces else None
+    if metres is not None and seen is not None and not given and not is_room(seen, usual):
+        metres = replace(metres, only_in_room=True)
+        warning = (
+            "no label network tells what the images show, and no ceiling is in them: the estimated size holds if the "
+            "scene is a room; outdoors it may be wrong by ten times. `msgs-slam models pull` brings a label network; "
+            "--scale-ref or --gps give the size itself"
+        )
+    return metres, warning
+
+
+def is_room(seen: Seen, usual: Sequence[Evidence]) -> bool:
+    """Return whether anything tells that the scene is a room: a network that would know outdoors, or a ceiling."""
+    return seen.is_named or any(p.kind == CEILING_HEIGHT for p in usual)
 
 
 def is_outdoors(seen: Seen) -> bool:

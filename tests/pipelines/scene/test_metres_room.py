@@ -13,6 +13,7 @@ from msgs_slam.formats.textfile import read_json, write_json
 from msgs_slam.pipelines.config import Config, ExportConfig
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.engine.stages import StageContext
+from msgs_slam.pipelines.export.stage import metres_figures
 from msgs_slam.pipelines.export.stage import run as export
 from msgs_slam.pipelines.geometry.room_layout import CEILING, FLOOR, OTHER, Gravity
 from msgs_slam.pipelines.geometry.se3 import Similarity
@@ -21,12 +22,13 @@ from msgs_slam.pipelines.networks.registry import _room_classes
 from msgs_slam.pipelines.run.files import DEPTH_FIELDS, FIGURES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene import metres as find
-from msgs_slam.pipelines.scene.evidence import OUTDOORS
+from msgs_slam.pipelines.scene.evidence import CEILING_HEIGHT, OUTDOORS, Evidence
 from msgs_slam.pipelines.scene.heights import camera_height, ceiling_height, floor_trust, sizes_of_things
 from msgs_slam.pipelines.scene.metres import (
     Seen,
     contradiction,
     find_metres,
+    is_room,
     known_evidence,
     load_seen,
     scene_evidence,
@@ -127,6 +129,29 @@ def test_outdoors_no_size_is_guessed(run: RunFolder, monkeypatch: pytest.MonkeyP
     assert metres is None
     assert warning is not None
     assert "outdoors by its labels" in warning
+
+
+def test_without_names_and_a_ceiling_the_size_holds_only_for_a_room(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = load_seen(run, run.load(TRAJECTORY, "mapping"))
+    assert is_room(replace(seen, is_named=True), [])
+    pieces = usual_evidence(replace(seen, is_named=False), None)
+    ceiling = Evidence("ceiling height", CEILING_HEIGHT, pieces[0].modes)
+    for named, evidence in ((True, pieces), (False, [*pieces, ceiling])):
+        monkeypatch.setattr(find, "load_seen", lambda *_, named=named: replace(seen, is_named=named))
+        monkeypatch.setattr(find, "usual_evidence", lambda *_, evidence=evidence: evidence)
+        metres, warning = found_in(run)
+        assert metres is not None
+        assert warning is None
+        assert "if the scene" not in metres.text
+    monkeypatch.setattr(find, "usual_evidence", lambda *_: [p for p in pieces if p.kind != CEILING_HEIGHT])
+    metres, warning = found_in(run)
+    assert metres is not None
+    assert warning is not None
+    assert "models pull" in warning
+    assert metres.text.endswith(", if the scene is a room)")
+    assert metres_figures(metres)["metres_from"].endswith("if the scene is a room")
 
 
 def test_a_reference_wins_over_what_is_usual(run: RunFolder) -> None:
