@@ -24,7 +24,7 @@ from .run.lock import RunBusyError
 from .system.progress import Progress, log
 from .system.wording import markdown_table
 
-_MOST_NAMED = 5
+_MAX_NAMED = 5
 _NOT_LISTED = (".", "__MACOSX")
 """How names begin that nobody gave: hidden files, and what macOS adds to an archive."""
 DONE, FAILED, ELSEWHERE, UNFINISHED, NOT_YET = "done", "failed", "in another process", "unfinished", "not yet"
@@ -57,7 +57,7 @@ def find_recordings(folder: Path, runs: Path) -> list[Recording]:
         log.warning(
             "left out, no images and no data set directly in them: %s (%d in all). Give each such folder to `batch` "
             "itself, or move what it holds up",
-            ", ".join(others[:_MOST_NAMED]), len(others),
+            ", ".join(others[:_MAX_NAMED]), len(others),
         )  # fmt: skip
     if not sources:
         raise InputError(f"{folder} holds no video, image folder or data set")

@@ -22,7 +22,7 @@ DISTRIBUTION = "msgs-slam"
 _MODULES = (
     "torch", "cv2", "pycolmap", "numba", "onnxruntime", "scipy", "skimage", "PIL", "trimesh", "plyfile", "safetensors"
 )  # fmt: skip
-_LEAST_MEMORY, _LEAST_DISK = 4.0, 3.0
+_MIN_MEMORY, _MIN_DISK = 4.0, 3.0
 """Gigabytes: the largest run of the benchmarks peaks at 1.8 and fills 0.5."""
 
 
@@ -130,9 +130,9 @@ def _memory() -> Finding:
     if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
         return Finding("memory", NOTE, "cannot be asked on this system")
     size = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9
-    if size < _LEAST_MEMORY:
+    if size < _MIN_MEMORY:
         fix = "--set frames.max_side=480 needs less, or take a machine with more"
-        return Finding("memory", NOTE, f"{size:.1f} GB; under {_LEAST_MEMORY:g} long videos may not fit", fix)
+        return Finding("memory", NOTE, f"{size:.1f} GB; under {_MIN_MEMORY:g} long videos may not fit", fix)
     return Finding("memory", GOOD, f"{size:.1f} GB")
 
 
@@ -177,7 +177,7 @@ def _disk(folder: Path) -> Finding:
     free = shutil.disk_usage(folder).free / 1e9
     if not os.access(folder, os.W_OK):
         return Finding("disk", BAD, f"{folder.resolve()} cannot be written", "work in another folder, or give --out")
-    if free < _LEAST_DISK:
+    if free < _MIN_DISK:
         fix = "make room, or write to another disk with --out"
-        return Finding("disk", BAD, f"{free:.1f} GB free in {folder.resolve()}; a run takes up to {_LEAST_DISK:g}", fix)
+        return Finding("disk", BAD, f"{free:.1f} GB free in {folder.resolve()}; a run takes up to {_MIN_DISK:g}", fix)
     return Finding("disk", GOOD, f"{free:.0f} GB free in {folder.resolve()}")

@@ -231,9 +231,9 @@ def _load_exposure(run: RunFolder, map_stage: str, trajectory: Trajectory) -> Ex
     return None
 
 
-def evenly(items: Sequence[T], most: int) -> list[T]:
-    """At most `most` of them, evenly spread, first and last among them."""
-    picked = np.unique(np.linspace(0, len(items) - 1, min(len(items), most)).round().astype(int))
+def spread_sample(items: Sequence[T], limit: int) -> list[T]:
+    """Return at most `limit` of the items, evenly spread, first and last among them."""
+    picked = np.unique(np.linspace(0, len(items) - 1, min(len(items), limit)).round().astype(int))
     return [items[i] for i in picked]
 
 

@@ -204,13 +204,13 @@ def require_run(run: RunFolder) -> None:
     raise InputError(f"{run.root} {what}{near} Runs are made by `msgs-slam reconstruct VIDEO`")
 
 
-def runs_near(path: Path, most: int = 3) -> list[Path]:
+def runs_near(path: Path, limit: int = 3) -> list[Path]:
     """Run folders that may be meant where `path` is none: in it, around it, of the video that it is, of a like name."""
     inside = sorted(path.iterdir()) if path.is_dir() else []
     named = [path.with_suffix(".msgs"), Path(f"{path.stem}.msgs")] if path.name else []  # "." and "/" have no name
     beside = [*named, *path.parents[:2]]
     found = dict.fromkeys(p for p in [*inside, *beside] if RunFolder(p).manifest_file.is_file())
-    return list(found)[:most]
+    return list(found)[:limit]
 
 
 def _run(

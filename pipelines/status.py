@@ -241,5 +241,5 @@ def _state(run: RunFolder, name: str, record: StageRecord | None, damaged: tuple
     return OUTDATED if run.stage(name).exists() else NOT_YET
 
 
-def _few(names: tuple[str, ...], most: int = 5) -> str:
-    return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
+def _few(names: tuple[str, ...], limit: int = 5) -> str:
+    return ", ".join(names[:limit]) + (", ..." if len(names) > limit else "")

@@ -217,10 +217,6 @@ class TaskBoard:
 
     def _do_locked(self, number: int, header: dict[str, Any], prepare: Callable[[str], Progress]) -> None:
         """Raises RecoverableError where this process cannot do the task; what else the work raises is a bug."""
-        if header["work"].partition(":")[0] not in TASK_MODULES:
-            raise InputError(
-                f"{self.folder / _HEADER}: {header['work']} is not a task of this program. Delete {self.folder}"
-            )
         kind, folder = header["work"].rpartition(":")[2], self.folder.parents[1] / header["folder"]
         progress = prepare(name := f"{kind} {number + 1}")
         try:
@@ -228,7 +224,12 @@ class TaskBoard:
         except InputError as error:
             raise RecoverableError(f"{name}: {error}") from error
         set_threads(header["threads"])
-        work, task = of_name(header["work"]), load_value(self.task(number))
+        work = of_name(header["work"])
+        if work.__module__ not in TASK_MODULES:
+            raise InputError(
+                f"{self.folder / _HEADER}: {header['work']} is not a task of this program. Delete {self.folder}"
+            )
+        task = load_value(self.task(number))
         # On a disk without locks another process may do the same task.
         with stopping_after_writes(folder), own_temporaries():
             try:

@@ -13,7 +13,7 @@ from ...formats.datasets import Sequence
 from ...formats.errors import InputError
 from ..geometry import se3
 from ..mapping.load import split_frames
-from ..outcome import Outcome, evenly
+from ..outcome import Outcome, spread_sample
 from ..render.api import Rendering, render
 from ..sfm.lens import FramePixels
 from ..system.progress import Progress, SilentProgress
@@ -27,9 +27,9 @@ from .views import MapView, render_outcome
 
 KEYFRAMES, BETWEEN, HELD_OUT = "keyframes", "between", "held out"
 AT_TRUE_POSES, AT_REFINED_POSES = " at true poses", " at refined poses"
-COVERED, LEAST_COVERED = 0.95, 0.2
+COVERED, MIN_COVERED = 0.95, 0.2
 """Silhouette of the pixels that a refined pose is found by, and the least share of them in an image."""
-SLOPE_PX, NOISE, MOST_STEPS = 0.2, 0.02, 10
+SLOPE_PX, NOISE, MAX_STEPS = 0.2, 0.02, 10
 """Pixels by which the image moves to measure its slopes; colour difference, of 1, that counts linearly beyond; steps.
 In a room of noise 0.02, from 1 cm and 0.3 degrees: within 0.15 mm of the true pose after 7 steps."""
 
@@ -299,13 +299,15 @@ def _jobs(
     poses = dict(zip(t.frame_ids.tolist(), t.cam_from_world, strict=True))
     jobs = []
     for kind, ids in ((KEYFRAMES, keyframes), (HELD_OUT, held_out), (BETWEEN, between)):
-        jobs += [(i, kind, poses[i]) for i in evenly(ids, max_views)]
-    jobs += [(i, HELD_OUT + AT_REFINED_POSES, refined_pose(outcome, i, poses[i])) for i in evenly(held_out, max_views)]
+        jobs += [(i, kind, poses[i]) for i in spread_sample(ids, max_views)]
+    jobs += [
+        (i, HELD_OUT + AT_REFINED_POSES, refined_pose(outcome, i, poses[i])) for i in spread_sample(held_out, max_views)
+    ]
     if alignment is None:
         return jobs
     # The true cameras, carried into the run's world.
     true_ids = [i for i in (held_out or between) if matched.has_pose[outcome.frame_row(i)]]
-    chosen = evenly(true_ids, max_views)
+    chosen = spread_sample(true_ids, max_views)
     rows = [outcome.frame_row(i) for i in chosen]
     true_poses = alignment.alignment.inverse().apply_to_poses(np.linalg.inv(matched.world_from_cam[rows]))
     kind = (HELD_OUT if held_out else BETWEEN) + AT_TRUE_POSES
@@ -331,7 +333,7 @@ def refined_pose(outcome: Outcome, frame_id: int, cam_from_world: NDArray[np.flo
 
     start = seen(cam_from_world)
     covered = start.silhouette >= COVERED
-    if covered.float().mean() < LEAST_COVERED:
+    if covered.float().mean() < MIN_COVERED:
         return cam_from_world
     # Steps are counted in pixels that the image moves by, of a translation as of a rotation.
     pixel = np.repeat([float(start.depth[covered].median()), 1.0], 3) / max(camera.fx, camera.fy)
@@ -345,7 +347,7 @@ def refined_pose(outcome: Outcome, frame_id: int, cam_from_world: NDArray[np.flo
         return np.stack([(differences(step + by) - here) / SLOPE_PX for by in SLOPE_PX * np.eye(6)], 1)
 
     fit = least_squares(
-        differences, np.zeros(6), slopes, loss="soft_l1", f_scale=NOISE, xtol=1e-3, ftol=1e-4, max_nfev=MOST_STEPS
+        differences, np.zeros(6), slopes, loss="soft_l1", f_scale=NOISE, xtol=1e-3, ftol=1e-4, max_nfev=MAX_STEPS
     )
     found: NDArray[np.float64] = se3.exp(fit.x * pixel) @ cam_from_world
     return found

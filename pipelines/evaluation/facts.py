@@ -22,7 +22,7 @@ _ENDS = (0.01, 0.99)
 """Quantiles of the solid Gaussians between which something is: beyond are floaters, and views through windows."""
 _UNSHARP = 0.005
 """The end is as unsharp as it moves when the share does by so much, either way."""
-_LEAST_GAUSSIANS, _LEAST_FRAMES = 1000, 5
+_MIN_GAUSSIANS, _MIN_FRAMES = 1000, 5
 
 _BLURRED = 0.35
 _DARK, _BRIGHT = 35.0, 225.0
@@ -207,7 +207,7 @@ def path_length(outcome: Outcome) -> tuple[float, float] | None:
     t = outcome.trajectory
     directions = rig_of(outcome.calibration.directions, len(outcome.frames))
     centers = t.centers[t.is_posed & (t.frame_ids < directions.stations)]
-    if len(centers) < _LEAST_FRAMES:
+    if len(centers) < _MIN_FRAMES:
         return None
     steps = np.diff(centers, axis=0)
     # A second difference of independent errors has six times their variance; walking bends it too, so it is a bound.
@@ -226,7 +226,7 @@ def extents(outcome: Outcome) -> list[tuple[float, float]]:
     those of the smallest rectangle. Nothing of a map that is hardly there."""
     gaussian_map = outcome.require_map()
     means = gaussian_map.means[gaussian_map.opacity_logits > 0].cpu().numpy().astype(np.float64)
-    if len(means) < _LEAST_GAUSSIANS:
+    if len(means) < _MIN_GAUSSIANS:
         return []
     inside = np.all([_between(means[:, k]) for k in range(3)], axis=0)
     _, _, degrees = cv2.minAreaRect(means[inside, :2].astype(np.float32))

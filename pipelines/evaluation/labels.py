@@ -258,8 +258,8 @@ def _lower(names: Iterable[str]) -> list[str]:
     return [n.strip().lower() for n in names]
 
 
-def _some(names: list[str], most: int = 12) -> str:
-    return ", ".join(names[:most]) + (" …" if len(names) > most else "")
+def _some(names: list[str], limit: int = 12) -> str:
+    return ", ".join(names[:limit]) + (" …" if len(names) > limit else "")
 
 
 def label_cells(

@@ -20,7 +20,7 @@ from ..export.readme import lengths, readme
 from ..export.stage import on_earth
 from ..export.writers import IMAGES
 from ..geometry.sparse_model import SparseModel
-from ..outcome import Outcome, evenly, load_outcome
+from ..outcome import Outcome, load_outcome, spread_sample
 from ..read_config import config_to_toml
 from ..run.files import FIGURES, LOOPS
 from ..run.folder import RunFolder, load_source
@@ -272,8 +272,8 @@ class RenderedViews:
 def render_views(outcome: Outcome, progress: Progress) -> RenderedViews:
     """Up to `MEASURED_VIEWS` keyframes, evenly spread; a few of them on the sheet."""
     t = outcome.trajectory
-    keyframes = evenly(t.frame_ids[t.is_keyframe].tolist(), MEASURED_VIEWS)
-    shown = set(evenly(keyframes, SHOWN_VIEWS))
+    keyframes = spread_sample(t.frame_ids[t.is_keyframe].tolist(), MEASURED_VIEWS)
+    shown = set(spread_sample(keyframes, SHOWN_VIEWS))
     values: list[float] = []
     tiles: list[str] = []
     reach = _reach(outcome, sorted(shown))

@@ -13,7 +13,7 @@ from ..source.recording import written_name
 from ..types import Frame
 from .trajectory_error import associate
 
-_MOST_SECONDS_APART = 0.02
+_MAX_SECONDS_APART = 0.02
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def match_by_time(times: NDArray[np.float64], sequence: Sequence) -> MatchedTrut
 
 def _tolerance(times: NDArray[np.float64]) -> float:
     """A third of the usual gap: a frame between two truths belongs to neither."""
-    return min(_MOST_SECONDS_APART, float(np.median(np.diff(times))) / 3) if len(times) > 1 else _MOST_SECONDS_APART
+    return min(_MAX_SECONDS_APART, float(np.median(np.diff(times))) / 3) if len(times) > 1 else _MAX_SECONDS_APART
 
 
 def true_trajectory(sequence: Sequence) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

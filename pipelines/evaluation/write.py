@@ -9,7 +9,7 @@ from ...formats.datasets import Sequence
 from ...formats.images import write_rgb
 from ...formats.textfile import write_json
 from ..geometry.se3 import Similarity, align_points
-from ..outcome import Outcome, evenly, load_outcome
+from ..outcome import Outcome, load_outcome, spread_sample
 from ..run.folder import RunFolder
 from ..sfm.lens import FramePixels
 from ..system.progress import Progress
@@ -119,7 +119,7 @@ def comparison_sheet(outcome: Outcome, matched: MatchedTruth, views: int = SHEET
     """Rows of frame, rendering, depths and labels; of frames with truth where there are some."""
     posed = np.flatnonzero(outcome.trajectory.is_posed)
     with_truth = [int(r) for r in posed if matched.image[r] >= 0]
-    rows = evenly(with_truth or posed.tolist(), views)
+    rows = spread_sample(with_truth or posed.tolist(), views)
     pixels = FramePixels(outcome.calibration)
     return sheet([_row(outcome, matched, pixels, row) for row in rows], TITLES)
 

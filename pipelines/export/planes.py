@@ -14,7 +14,7 @@ from ..geometry.camera import resample_nearest, unproject_depth
 from ..geometry.posed_depth import PosedDepth
 from ..geometry.voxels import VOXELS_PER_DEPTH, Voxels, find, gather_depths, neighbour_keys, normals_in_cam, voxel_keys
 from ..mapping.measure import DrawnView
-from ..outcome import evenly
+from ..outcome import spread_sample
 
 _SIDE = 200
 _COMPARED = 24
@@ -115,7 +115,7 @@ def _on(voxels: Voxels, normal: Array, offset: float, within: float, along: floa
 
 def planes_of(views: Sequence[DrawnView]) -> Planes:
     """The planes of what the views surely show."""
-    some = (views[n].shown for n in evenly(range(len(views)), _COMPARED))
+    some = (views[n].shown for n in spread_sample(range(len(views)), _COMPARED))
     seen = [float(np.median(v.depth[v.trust > 0])) for v in some if (v.trust > 0).any()]
     size = float(np.median(seen)) / VOXELS_PER_DEPTH if seen else 1.0
     return find_planes(gather_depths((_sure_part(view) for view in views), size))

@@ -20,7 +20,7 @@ from ..sfm.lens import Lens
 from ..system.wording import stretches
 from ..types import Frame, GivenPoses
 
-_LEAST_PART = 3
+_MIN_PART = 3
 _APART, _ZOOM, _OFF = 5.0, 0.03, 0.05
 """Standard deviations by which two focal lengths contradict each other, if they are also so far apart relatively: those
 of two halves of a recording, and one found beside one known before. Halves of five recordings without zoom: up to 3.2.
@@ -89,14 +89,14 @@ def warn_of_structure(context: StageContext, structure: Structure, ids: list[int
             f"{len(inside)} of them, frames {inside[0]}-{inside[-1]}, are consistent with each other: unless tracking "
             "connects them, they become a separate piece"
         )
-    parts = [p for p in report.parts if len(p) >= _LEAST_PART]
+    parts = [p for p in report.parts if len(p) >= _MIN_PART]
     if len(parts) > 1:
         named = ", ".join(f"{ids[p[0]]}-{ids[p[-1]]}" for p in parts)
         context.warn(
             f"structure from motion gave {len(parts)} disconnected parts (frames {named}): "
             "tracking joins those it recognises"
         )
-    alone = sorted(ids[k] for p in report.parts if len(p) < _LEAST_PART for k in p)
+    alone = sorted(ids[k] for p in report.parts if len(p) < _MIN_PART for k in p)
     if alone:
         context.warn(
             f"{len(alone)} keyframes share hardly any points with the others (frames "

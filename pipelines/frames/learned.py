@@ -20,7 +20,7 @@ from ..types import Features
 EXTRACTOR, MATCHER = "aliked-n16rot", "aliked-lightglue"
 _MULTIPLE = 32
 """Sides of the network's input; the image's last row and column go on to fill it."""
-_LEAST_SCORE, _LEAST_MATCH = 0.2, 0.1
+_MIN_SCORE, _MIN_MATCH = 0.2, 0.1
 """Of a feature, and of a match."""
 _INPUTS = {"aliked": {"image", "max_keypoints", "min_score"},
            "lightglue": {"kpts0", "kpts1", "desc0", "desc1", "image_size0", "image_size1"}}  # fmt: skip
@@ -42,7 +42,7 @@ class LearnedFeatures:
         feed = {
             "image": np.ascontiguousarray(padded.transpose(2, 0, 1)[None], np.float32) / np.float32(255),
             "max_keypoints": np.array(count, np.int64),
-            "min_score": np.array(_LEAST_SCORE, np.float32),
+            "min_score": np.array(_MIN_SCORE, np.float32),
         }
         keypoints, descriptors = (found[0] for found in self._extractor.run(["keypoints", "descriptors"], feed))
         # -1 and 1 are the centres of the first and the last pixel.
@@ -66,7 +66,7 @@ class LearnedFeatures:
             feed[f"image_size{number}"] = np.array([size], np.float32)
         partner, score = self._matcher.run(["matches0", "mscores0"], feed)
         partner = partner.astype(np.int64)
-        index = np.flatnonzero((partner >= 0) & (partner < len(second)) & (score >= _LEAST_MATCH))
+        index = np.flatnonzero((partner >= 0) & (partner < len(second)) & (score >= _MIN_MATCH))
         return np.stack([index, partner[index]], axis=1).astype(np.uint32)
 
 

@@ -22,7 +22,7 @@ _PAIRS = 60
 _DOUBTFUL = 1.2
 """A focal length from pairs of views that is farther off by this factor is followed up: from pairs alone it is right to
 8 %."""
-_LEAST_BETTER = 0.1
+_MIN_BETTER = 0.1
 """Share of the cost of all matches that goes without the prior where it was wrong."""
 _SIGNIFICANT = 3.0
 """Standard deviations between two focal lengths that contradict each other."""
@@ -99,7 +99,7 @@ def _is_better(free: Structure, held: Structure) -> bool:
     xy = [f.xy for f in free.features]
     apart = abs(_focal(free) - _focal(held)) > _SIGNIFICANT * math.hypot(free.focal_sd, held.focal_sd)
     left = unexplained(free.model, free.pairs, xy), unexplained(held.model, free.pairs, xy)
-    return apart and free.report.registered >= held.report.registered and left[0] < (1 - _LEAST_BETTER) * left[1]
+    return apart and free.report.registered >= held.report.registered and left[0] < (1 - _MIN_BETTER) * left[1]
 
 
 def _focal(structure: Structure) -> float:

@@ -15,7 +15,7 @@ from .camera import project, unproject
 Array = NDArray[np.float64]
 
 NEIGHBOURS = 16
-_LEAST_OVERLAP = 0.2
+_MIN_OVERLAP = 0.2
 _OVERLAP_SAMPLES = 16
 CANDIDATES = 256
 _REACH = 1.5
@@ -136,6 +136,6 @@ def neighbours(views: Iterable[PosedDepth]) -> list[tuple[int, int]]:
         row = slice(overlap.indptr[i], overlap.indptr[i + 1])
         others, share = overlap.indices[row], overlap.data[row]
         order = np.argsort(-share, kind="stable")
-        seeing = [int(others[n]) for n in order if others[n] != i and share[n] > _LEAST_OVERLAP]
+        seeing = [int(others[n]) for n in order if others[n] != i and share[n] > _MIN_OVERLAP]
         pairs += [(i, j) for j in seeing[:: max(len(seeing) // NEIGHBOURS, 1)][:NEIGHBOURS]]
     return pairs

@@ -12,7 +12,7 @@ NAMES = {FLOOR: "floor", CEILING: "ceiling", WALL: "wall", SURFACE: "surface"}
 
 _HORIZONTAL = np.cos(np.radians(25))
 _VERTICAL = np.sin(np.radians(20))
-_LEAST_SHARE = 0.015
+_MIN_SHARE = 0.015
 """A plane with a smaller share of all surface is not named."""
 _BEYOND_SHARE = 0.03
 """Behind a wall, under a floor, over a ceiling there is at most this share of the surface."""
@@ -43,7 +43,7 @@ def find_gravity(voxels: Voxels, cam_up: NDArray[np.float64]) -> Gravity:
         up = (normals[close] * weight[close, None]).sum(0)
         up = up / np.linalg.norm(up)
     share = weight[normals @ up > np.cos(np.radians(8))].sum() / voxels.weight.sum()
-    return Gravity(up, bool(share > 2 * _LEAST_SHARE))
+    return Gravity(up, bool(share > 2 * _MIN_SHARE))
 
 
 def _support(normals: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -105,7 +105,7 @@ def floor_plane(
 
 
 def levels(
-    value: NDArray[np.float64], share: NDArray[np.float64], size: float, least: float = _LEAST_SHARE
+    value: NDArray[np.float64], share: NDArray[np.float64], size: float, least: float = _MIN_SHARE
 ) -> list[float]:
     """Peaks of a histogram of `value` weighted by `share`, largest first, each with at least the share `least`."""
     if share.sum() < least:
@@ -141,7 +141,7 @@ def _name_walls(
         azimuth = np.arctan2(voxels.normal @ second, voxels.normal @ first)
         bins = np.bincount(((azimuth[left] + np.pi) / (2 * np.pi) * 72).astype(np.int64) % 72, share[left], 72)
         smooth = bins + np.roll(bins, 1) + np.roll(bins, -1)
-        if smooth.max() < _LEAST_SHARE:
+        if smooth.max() < _MIN_SHARE:
             return
         angle = (int(smooth.argmax()) + 0.5) / 72 * 2 * np.pi - np.pi
         facing = left & (np.cos(azimuth - angle) > np.cos(np.radians(12)))

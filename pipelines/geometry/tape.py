@@ -13,8 +13,8 @@ Array = NDArray[np.float64]
 
 _REACH = 3.0
 """Standard deviations from its middle at which a Gaussian still counts."""
-_MOST_ALPHA = 0.99
-_LEAST_COVER = 0.5
+_MAX_ALPHA = 0.99
+_MIN_COVER = 0.5
 """Lines of sight that the map covers less meet nothing."""
 _AIM_PIXELS = 1.0
 """Standard deviation of where a person clicks."""
@@ -46,7 +46,7 @@ def touch(cloud: GaussianCloud, origin: Array, direction: Array, pixel: float) -
     depth, alpha = depth[order], alpha[order]
     left = np.cumprod(np.append(1.0, 1 - alpha))
     covered = 1 - left[-1]
-    if covered < _LEAST_COVER:
+    if covered < _MIN_COVER:
         return None
     shares = (1 - left[1:]) / covered
     low, middle, high = (float(depth[np.searchsorted(shares, q)]) for q in (0.16, 0.5, 0.84))
@@ -67,7 +67,7 @@ def _crossed(cloud: GaussianCloud, origin: Array, direction: Array) -> tuple[Arr
     depth = (to_middle * step).sum(1) / (step**2).sum(1)
     missed = ((to_middle - depth[:, None] * step) ** 2).sum(1)
     opacity = 1 / (1 + np.exp(-cloud.opacity_logits[near].astype(np.float64)))
-    return depth, np.minimum(opacity * np.exp(-missed / 2), _MOST_ALPHA)
+    return depth, np.minimum(opacity * np.exp(-missed / 2), _MAX_ALPHA)
 
 
 def tape(first: Touch, second: Touch) -> tuple[float, float]:

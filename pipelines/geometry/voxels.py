@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 VOXELS_PER_DEPTH = 60
 """A voxel is this fraction of the scene's median depth: 5 cm at 3 m."""
-LEAST_WEIGHT = 1.5
+MIN_WEIGHT = 1.5
 """A voxel of less, one sure pixel and a half, is noise."""
 _BITS = 21
 _HALF = 1 << (_BITS - 1)
 _WAITING = 500_000
 """Voxels of single frames that wait to be summed, at least."""
-MOST, _COARSER = 750_000, 2**0.5
+MAX_VOXELS, _COARSER = 750_000, 2**0.5
 """Voxels, and how much larger they become where a scene has more: half of them are left. They take about 300 bytes each
 while they are looked at, by no recording but memory alone."""
 _BLOCK = 50_000
@@ -164,14 +164,14 @@ def gather_depths(views: Iterable[PosedDepth], size: float) -> Voxels:
 def merge(
     size: float,
     frames: Iterable[tuple[NDArray[np.int64], NDArray[np.float64]]],
-    most: int = MOST,
+    limit: int = MAX_VOXELS,
     least: float = 0.0,
 ) -> Voxels:
     """Merge the frames' voxels, and drop those that no more than the `least` weight speaks for.
 
-    Memory grows with the scene, not with the number of frames; where there are more than `most`, they grow instead.
+    Memory grows with the scene, not with the number of frames; where there are more than `limit`, they grow instead.
     """
-    gathered = _Gathered(size, most, np.empty(0, np.int64), [np.empty(0)] * 10)
+    gathered = _Gathered(size, limit, np.empty(0, np.int64), [np.empty(0)] * 10)
     waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
     for row in frames:
         waiting.append(row)
@@ -193,7 +193,7 @@ class _Gathered:
     """Sorted keys (V,) of cubes of a size, and ten sums (V,) each: weight, position, normal, colour."""
 
     size: float
-    most: int
+    limit: int
     keys: NDArray[np.int64]
     sums: list[NDArray[np.float64]]
 
@@ -201,7 +201,7 @@ class _Gathered:
         """Rows of frames, in cubes of `size`; one of the sums at a time is there twice."""
         keys = [k if size == self.size else voxel_keys(v[:, 1:4] / v[:, :1], self.size) for k, v in rows]
         self._sum(np.concatenate([self.keys, *keys]), [v for _, v in rows])
-        while len(self.keys) > self.most:
+        while len(self.keys) > self.limit:
             self.size *= _COARSER
             weight = np.maximum(self.sums[0], 1e-12)
             self._sum(voxel_keys(np.stack([x / weight for x in self.sums[1:4]], axis=1), self.size), [])

@@ -25,7 +25,7 @@ SHARED_POINTS = 15
 """Keyframes with this many points in common need no loop."""
 RICH = 0.9
 """Keyframes of a richness above this propose loops by semantics, eq. (21)."""
-PER_KEYFRAME, LEAST_ALIKE = 2, 0.02
+PER_KEYFRAME, MIN_ALIKE = 2, 0.02
 """Loops proposed by each keyframe's appearance, and the least appearance similarity of one."""
 SIMILAR = 0.6
 """T_loop of eq. (23) on the similarity of eq. (24)."""
@@ -58,7 +58,7 @@ def loop_candidates(
     def unrelated(part: slice) -> NDArray[np.bool_]:
         return apart(part) & (shared[part].toarray() < SHARED_POINTS)
 
-    alike = loop_pairs(looks, unrelated, PER_KEYFRAME, LEAST_ALIKE)
+    alike = loop_pairs(looks, unrelated, PER_KEYFRAME, MIN_ALIKE)
     by_labels = _semantic_candidates(unrelated, looks, summaries) if settings.use_semantics else set()
     return sorted(pair for pair in {*alike, *by_labels} if (ids[pair[0]], ids[pair[1]]) not in refused)
 

@@ -22,7 +22,7 @@ _SAMPLE = 20000
 _ROUNDS = 20
 _SOFTNESS = 0.1
 """Cosine similarity by which a cluster must lead to be e times as likely."""
-_LEAST_SHARE = 0.001
+_MIN_SHARE = 0.001
 """A class on a smaller share of all pixels is noise of the network and becomes void."""
 _SIDE = 160
 """Samples of the probabilities that are kept along the longer side of an image: networks give 33 to 128."""
@@ -35,9 +35,15 @@ class OnnxLabels(SemanticsProvider):
 
     shared_state: tuple[str, ...] = ("_label_of", "_scene")
 
-    def __init__(self, card: Card, place: Workplace, most: int, no_people: bool = False) -> None:
-        """Opens the network; `most` numbered objects of what has no name; `no_people`: nothing is called a person.
-        Raises InputError when the network cannot be what the card says."""
+    def __init__(self, card: Card, place: Workplace, limit: int, no_people: bool = False) -> None:
+        """Open the network. Raises InputError when it cannot be what the card says.
+
+        Args:
+            card: describes the network.
+            place: sequence, device, threads, cache and progress.
+            limit: of numbered objects, for what has no name.
+            no_people: nothing is called a person.
+        """
         if card.task != "segmentation":
             raise InputError(
                 f"{card.model}: its card says {card.task}, but proxy.semantics needs a segmentation network"
@@ -47,7 +53,7 @@ class OnnxLabels(SemanticsProvider):
         self.name = card.name
         self._names, self._void = card.labels, card.void
         self._people = [i for i, name in enumerate(card.labels) if no_people and name == "person"]
-        self._most = most
+        self._limit = limit
         self._progress = place.progress
         self._classes = ClassTable((), ())
         self._label_of = np.empty(0, np.uint8)
@@ -67,8 +73,8 @@ class OnnxLabels(SemanticsProvider):
         self.precompute(frames)
         self._learn(frames)
         if self._has_world(frames, depth_of):
-            segments = SegmentLabels(self._sequence, self._most, self._progress)
-            vocabulary = Vocabulary(self._names, self._void, self._most)
+            segments = SegmentLabels(self._sequence, self._limit, self._progress)
+            vocabulary = Vocabulary(self._names, self._void, self._limit)
             self._scene = NamedScene.gather(segments, frames, depth_of, self._probabilities, vocabulary)
             names, kept = self._scene.names, self._scene.kept
         else:
@@ -90,7 +96,7 @@ class OnnxLabels(SemanticsProvider):
             counts += np.bincount(
                 best_classes(self._probabilities(frame), self._void)[0].ravel() + 1, None, len(counts)
             )
-        kept = np.flatnonzero(counts[1:] >= _LEAST_SHARE * counts.sum())
+        kept = np.flatnonzero(counts[1:] >= _MIN_SHARE * counts.sum())
         # Index 0 of the table is void: ids are stored plus one.
         self._label_of = np.full(len(self._names) + 1, VOID, np.uint8)
         self._label_of[kept + 1] = np.arange(len(kept), dtype=np.uint8)
@@ -140,9 +146,9 @@ class OnnxClusters(OnnxLabels):
 
     shared_state = (*OnnxLabels.shared_state, "_centres")
 
-    def __init__(self, card: Card, place: Workplace, most: int) -> None:
-        """`most` clusters at the most. Raises InputError as `OnnxLabels`."""
-        super().__init__(card, place, most)
+    def __init__(self, card: Card, place: Workplace, limit: int) -> None:
+        """`limit` clusters at the most. Raises InputError as `OnnxLabels`."""
+        super().__init__(card, place, limit)
         self._centres = np.empty((0, 0), np.float32)
 
     def _compute(self, image: NDArray[np.uint8]) -> Arrays:
@@ -160,7 +166,7 @@ class OnnxClusters(OnnxLabels):
             features = self._features(frame)
             features = features.reshape(-1, features.shape[-1])
             rows.append(features[rng.permutation(len(features))[:each]])
-        centres = spherical_kmeans(np.concatenate(rows), self._most, rng)
+        centres = spherical_kmeans(np.concatenate(rows), self._limit, rng)
         self._centres = centres
         self._names = tuple(f"cluster {i + 1}" for i in range(len(centres)))
 
@@ -176,13 +182,13 @@ class OnnxClusters(OnnxLabels):
         return softmax(small.take((self._features(frame) @ self._centres.T) / np.float32(_SOFTNESS)))
 
 
-def spherical_kmeans(vectors: NDArray[np.float32], most: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """(k, F) unit centres of unit vectors (Q, F), the largest cluster first; k <= most, fewer when vectors repeat.
+def spherical_kmeans(vectors: NDArray[np.float32], limit: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    """(k, F) unit centres of unit vectors (Q, F), the largest cluster first; k <= limit, fewer when vectors repeat.
 
     Started far apart, each centre at the vector that the ones before it say least of.
     """
     centres = vectors[rng.integers(len(vectors))][None]
-    while len(centres) < most:
+    while len(centres) < limit:
         nearest = (vectors @ centres.T).max(1)
         if nearest.min() > 1 - 1e-4:
             break

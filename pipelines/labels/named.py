@@ -43,24 +43,24 @@ _ALIKE = (
     frozenset({"table", "desk", "coffee table", "counter", "countertop", "kitchen island"}),
 )
 """Names that one thing may bear from different sides, but not at once."""
-_LEAST_AGREEMENT = 2 / 3
+_MIN_AGREEMENT = 2 / 3
 """Share of a thing that bears one name already, without which it may as well be two things that touch. A table and a
 chair that became one bed have 0.53; sofas of two recordings are at 0.7 and above 0.9."""
 
-_LEAST_CONFIDENCE = 0.3
+_MIN_CONFIDENCE = 0.3
 _ALONE = 0.3
 """Weight of what one frame says of a pixel whose place is not known."""
-_LEAST_SHARE = 0.0005
+_MIN_SHARE = 0.0005
 """A class on a smaller share of what was seen is noise of the network."""
 
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """The network's names; `void`: those that say nothing; `most`: numbered objects fill up to this many classes."""
+    """The network's names; `void`: those that say nothing; `limit`: numbered objects fill up to this many classes."""
 
     names: tuple[str, ...]
     void: tuple[int, ...]
-    most: int
+    limit: int
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def _vote(
     rows, columns, classes = probabilities.shape
     at = find(voxels.keys, _keys(sequence, frame, resample_nearest(depth.depth, rows, columns), voxels.size))
     confidence = resample_nearest(depth.confidence, rows, columns)
-    use = (at >= 0) & (confidence >= _LEAST_CONFIDENCE) & (probabilities.sum(-1) > 0)
+    use = (at >= 0) & (confidence >= _MIN_CONFIDENCE) & (probabilities.sum(-1) > 0)
     seen, place = np.unique(at[use], return_inverse=True)
     weight = confidence[use]
     heard = np.bincount(place, weight, len(seen)).astype(np.float32)
@@ -166,11 +166,11 @@ def _settle(
     void = np.isin(best, vocabulary.void) & said
     weight = voxels.weight / voxels.weight.sum()
     mass = np.bincount(best[said], weight[said], len(vocabulary.names)) * (1 - elsewhere.sum()) + elsewhere
-    named = np.setdiff1d(np.flatnonzero(mass >= _LEAST_SHARE), vocabulary.void)
+    named = np.setdiff1d(np.flatnonzero(mass >= _MIN_SHARE), vocabulary.void)
     columns, names = share[:, named], [vocabulary.names[i] for i in named]
     objects = np.full(len(voxels), -1, np.int64)
-    if weight[void].sum() >= _LEAST_SHARE:
-        objects[void] = cut_parts(select(voxels, void), max(vocabulary.most - len(named), 1))
+    if weight[void].sum() >= _MIN_SHARE:
+        objects[void] = cut_parts(select(voxels, void), max(vocabulary.limit - len(named), 1))
     count = int(objects.max(initial=-1)) + 1
     own = np.zeros((len(voxels), count), np.float32)
     inside = np.flatnonzero(objects >= 0)
@@ -219,7 +219,7 @@ def _things(
         own = np.searchsorted(members, label[inside])
         thing = _touching(voxels.keys[inside])
         votes = csr_matrix((voxels.weight[inside], (thing, own)), (thing.max() + 1, len(members))).toarray()
-        agrees = votes.max(1) >= _LEAST_AGREEMENT * votes.sum(1)
+        agrees = votes.max(1) >= _MIN_AGREEMENT * votes.sum(1)
         yield members, inside, np.where(agrees, votes.argmax(1), -1)[thing]
 
 

@@ -14,7 +14,7 @@ from ...formats.errors import InputError
 from ..depth.stereo.fill import spread_in_place
 from ..geometry.camera import resample_nearest, unproject_depth
 from ..geometry.room_layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
-from ..geometry.voxels import LEAST_WEIGHT, VOXELS_PER_DEPTH, Voxels, find_near, gather_frame, merge, select, voxel_keys
+from ..geometry.voxels import MIN_WEIGHT, VOXELS_PER_DEPTH, Voxels, find_near, gather_frame, merge, select, voxel_keys
 from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, Sequence, class_colors
 from ..system.jit import kernel
 from ..system.memory import release_free_memory
@@ -23,10 +23,10 @@ from ..types import VOID, ClassTable, Frame
 from .parts import cut_parts
 
 _GATHER_SIDE = 200
-_LEAST_CONFIDENCE = 0.3
+_MIN_CONFIDENCE = 0.3
 _REACH = 40.0
 _COLOR_SD = 40.0
-_LEAST_VOTE = 1e-3
+_MIN_VOTE = 1e-3
 
 
 class SegmentLabels(SemanticsProvider):
@@ -35,14 +35,14 @@ class SegmentLabels(SemanticsProvider):
     name = "segments"
     shared_state = ("_size", "_keys", "_label", "_classes")
 
-    def __init__(self, sequence: Sequence, most: int, progress: Progress) -> None:
-        """`most` classes at the most. Raises InputError without a backbone."""
+    def __init__(self, sequence: Sequence, limit: int, progress: Progress) -> None:
+        """`limit` classes at the most. Raises InputError without a backbone."""
         if not sequence.cam_from_world:
             raise InputError(
                 "regions of the scene need camera poses, and structure from motion found none: the camera stands still "
                 "or only turns. Move it sideways, or give classes with --semantics files:FOLDER or onnx:CARD"
             )
-        self.sequence, self._most, self._progress = sequence, most, progress
+        self.sequence, self._limit, self._progress = sequence, limit, progress
         self._size = 1.0
         self._keys = np.empty(0, np.int64)
         self._label = np.empty(0, np.uint8)
@@ -57,7 +57,7 @@ class SegmentLabels(SemanticsProvider):
     def fit(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Gather all frames and cut the scene."""
         voxels, gravity, kind = self.structure(frames, depth_of)
-        self._name(kind, cut_parts(select(voxels, kind == OTHER), self._most - len(NAMES) - 1))
+        self._name(kind, cut_parts(select(voxels, kind == OTHER), self._limit - len(NAMES) - 1))
         self._keys = voxels.keys
         self._gravity = [round(float(v), 4) for v in gravity.up] if gravity.is_sure else []
 
@@ -69,7 +69,7 @@ class SegmentLabels(SemanticsProvider):
         self._size = _scene_depth([depth_of(f) for f in posed[:: max(1, len(posed) // 12)]]) / VOXELS_PER_DEPTH
         release_free_memory()  # what depths and moving things have needed
         tracked = self._progress.track(posed, "regions", len(posed))
-        voxels = merge(self._size, (self._gather(f, depth_of(f)) for f in tracked), least=LEAST_WEIGHT)
+        voxels = merge(self._size, (self._gather(f, depth_of(f)) for f in tracked), least=MIN_WEIGHT)
         self._size = voxels.size
         cameras = np.array([self._world_from_cam[f.id] for f in posed])
         gravity = find_gravity(voxels, -cameras[:, :3, 1].mean(0))
@@ -89,7 +89,7 @@ class SegmentLabels(SemanticsProvider):
         confidence = resample_nearest(estimate.confidence, small.height, small.width)
         return gather_frame(
             resample_nearest(estimate.depth, small.height, small.width),
-            np.where(confidence >= _LEAST_CONFIDENCE, confidence, 0).astype(np.float32),
+            np.where(confidence >= _MIN_CONFIDENCE, confidence, 0).astype(np.float32),
             resample_nearest(self.sequence.image(frame), small.height, small.width),
             small,
             self._world_from_cam[frame.id],
@@ -143,7 +143,7 @@ def label_pixels(votes: NDArray[np.float32], trust: NDArray[np.float32], image: 
     """Labels (h, w) from votes (h, w, C) that count by the `trust` (h, w) in the place they are of, spread along like
     colours of the image to where it is low; VOID where nothing is known from near or far. The votes are spread in
     place: of a network's classes each copy takes as much memory as all else of a frame."""
-    votes *= (_LEAST_VOTE + trust**2)[..., None]
+    votes *= (_MIN_VOTE + trust**2)[..., None]
     spread_in_place(votes, image, _REACH, _COLOR_SD)
     return LabelEstimate(*_settle(votes))
 
@@ -169,7 +169,7 @@ def _settle(total: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.f
 
 def _scene_depth(estimates: list[DepthEstimate]) -> float:
     """Median of the known depths. Raises InputError when there is none."""
-    known = [e.depth[(e.depth > 0) & (e.confidence >= _LEAST_CONFIDENCE)][::7] for e in estimates]
+    known = [e.depth[(e.depth > 0) & (e.confidence >= _MIN_CONFIDENCE)][::7] for e in estimates]
     if not sum(map(len, known)):
         raise InputError("no reliable depth in any frame, so there are no regions; give another --depth provider")
     return float(np.median(np.concatenate(known)))

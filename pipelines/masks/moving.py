@@ -29,7 +29,7 @@ _FAR = 1.3
 """Keyframes farther apart (distance over median depth, plus two for a radian) see little of each other."""
 _UNLIKE, _LIKE = 12.0, 7.2
 """Difference in CIE Lab (lightness counts 0.6) from and up to which a colour is another and the same."""
-_LEAST = 3
+_MIN_WITNESSES = 3
 """Witnesses against a pixel."""
 _SURE_COUNT = 200
 """Pixels needed to estimate how much brighter one image is than another."""
@@ -51,7 +51,7 @@ _FIRST, _AGAIN = Rules(0.28, 0.03, True), Rules(0.1, 0.04, False)
 """Depth that was filled in over a plain surface has at most 0.276: a guess that is wrong in most views accuses a whole
 cupboard. Once something is found in an image, less will do for the rest of it."""
 _ROUNDS = 3
-_LEAST_SHARE = 0.006
+_MIN_SHARE = 0.006
 """Of the image: the evidence in a thing; and of the thing itself:"""
 _DENSE = 0.5
 _RIM = 5
@@ -151,7 +151,7 @@ def _evidence(
             may_accuse &= _in_sight(view.depth, np.linalg.inv(view_from_other), camera)
         _judge(own, expected, source >= 0, may_accuse, votes)
     against, for_it = votes
-    return cv2.medianBlur(((against >= _LEAST) & (against > for_it)).astype(np.uint8), 3) > 0
+    return cv2.medianBlur(((against >= _MIN_WITNESSES) & (against > for_it)).astype(np.uint8), 3) > 0
 
 
 @kernel
@@ -215,7 +215,7 @@ def _things(evidence: NDArray[np.bool_], gap: float, before: NDArray[np.bool_] |
     closed = cv2.morphologyEx(around, cv2.MORPH_CLOSE, disc)[reach:-reach, reach:-reach]
     count, piece, stats, _ = cv2.connectedComponentsWithStats(np.ascontiguousarray(closed))
     inside = np.bincount(piece.ravel(), evidence.ravel(), count)
-    keep = (inside >= _LEAST_SHARE * evidence.size) & (inside > _DENSE * stats[:, cv2.CC_STAT_AREA])
+    keep = (inside >= _MIN_SHARE * evidence.size) & (inside > _DENSE * stats[:, cv2.CC_STAT_AREA])
     if before is not None:
         keep &= np.bincount(piece.ravel(), before.ravel(), count) > 0
     keep[0] = False

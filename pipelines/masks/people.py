@@ -20,7 +20,7 @@ _MAYBE = 0.3
 _SURE = 0.75
 """Both networks' mean over a candidate. Chosen on 70 images of 7 recordings: people had 0.82 and more, other things
 0.67 and less, but for one rucksack."""
-_LEAST_SHARE = 0.001
+_MIN_SHARE = 0.001
 _REACH = 0.12
 """Of the image's long side: what the person network sees so near a candidate belongs to it (feet, hair, hands)."""
 _HARDLY = 0.1
@@ -63,7 +63,7 @@ class PeopleFinder:
         """(h, w) where an RGB image (h, w, 3) shows people, with a rim around them."""
         person = person_probability(self._person, image)
         # Half of the smallest piece has to be likelier a person than not: often that spares the larger network.
-        if (person > 0.5).mean() < _LEAST_SHARE / 2:
+        if (person > 0.5).mean() < _MIN_SHARE / 2:
             return np.zeros(person.shape, bool)
         return join_people(person, self._class_probability(image))
 
@@ -85,7 +85,7 @@ def join_people(person: NDArray[np.float32], by_class: NDArray[np.float32]) -> N
     count, piece, stats, _ = cv2.connectedComponentsWithStats((by_class > _MAYBE).astype(np.uint8))
     sizes = np.maximum(stats[:, cv2.CC_STAT_AREA], 1)
     sure = np.minimum(*(np.bincount(piece.ravel(), p.ravel(), count) / sizes for p in (person, by_class))) > _SURE
-    sure &= sizes >= _LEAST_SHARE * piece.size
+    sure &= sizes >= _MIN_SHARE * piece.size
     sure[0] = False
     found = sure[piece]
     if not found.any():

@@ -12,7 +12,7 @@ from ..types import Intrinsics
 from .session import Letterbox, Network
 
 _ALIKE = np.radians(30)
-_LEAST_COSINE = 0.7
+_MIN_COSINE = 0.7
 
 
 PLAIN_CONFIDENCE = 0.5
@@ -102,7 +102,7 @@ def _normals(
     normals = np.where((normals * rays).sum(-1, keepdims=True) > 0, -normals, normals)
     slope = normals_in_cam(depth, intrinsics)
     both = (np.abs(slope).sum(-1) > 0) & (np.abs(normals).sum(-1) > 0)
-    if not both.any() or np.median((slope * normals).sum(-1)[both]) < _LEAST_COSINE:
+    if not both.any() or np.median((slope * normals).sum(-1)[both]) < _MIN_COSINE:
         return None
     return normals.astype(np.float32)
 

@@ -28,7 +28,7 @@ _BATCH_NORM_EPSILON = 1e-5
 _MAX_BYTES = 1 << 28
 
 OTHER = "other"
-MOST_WORDS = 200
+MAX_WORDS = 200
 """Labels are bytes, and numbered objects need some too."""
 _MAX_TOKENIZER_BYTES = 1 << 26
 
@@ -56,8 +56,8 @@ def with_words(card: Card, text: str) -> Card:
         raise InputError(f'{card.model.name} finds what it is asked for: --classes "radiator, bookshelf, lamp"')
     known = [word.casefold() for word in words]
     twice = [word for i, word in enumerate(words) if known[i] in known[:i]]
-    if twice or len(words) > MOST_WORDS:
-        problem = f"{twice[0]!r} is there twice" if twice else f"{len(words)} words, at most {MOST_WORDS}"
+    if twice or len(words) > MAX_WORDS:
+        problem = f"{twice[0]!r} is there twice" if twice else f"{len(words)} words, at most {MAX_WORDS}"
         raise InputError(f"proxy.classes: {problem}. Name every class once")
     background = tuple(phrase for phrase in card.background if phrase.casefold() not in known)
     card = replace(card, classes=(*words, *background), groups=(*words, *(OTHER for _ in background)))

@@ -18,14 +18,14 @@ from ..source.opening import FolderSource, open_source
 from ..system.progress import log
 from .world import Georeference, World
 
-_LEAST_FIXES = 4
+_MIN_FIXES = 4
 _TRIALS = 500
-_LEAST_SPAN = 3.0
+_MIN_SPAN = 3.0
 """The path must span so many times the residual's deviation: else noise decides scale and heading."""
 
 Array = NDArray[np.float64]
 OFF, AUTO = "off", "auto"
-_LEAST_GAP = 2.0
+_MIN_GAP = 2.0
 """Seconds from a fix at which a track still gives a position; slower tracks give it within their own step."""
 
 
@@ -80,7 +80,7 @@ def _track_places(outcome: Outcome, track: Track) -> Array:
     if times[-1] < track.times[0] or times[0] > track.times[-1]:
         track = replace(track, times=track.times - track.times[0] + times[0])
     step = float(np.median(np.diff(track.times))) if len(track.times) > 1 else 0.0
-    return track.at(times, max(_LEAST_GAP, step))
+    return track.at(times, max(_MIN_GAP, step))
 
 
 def georeference(centers: Array, places: Array, metric: bool) -> tuple[Similarity, Georeference] | str:
@@ -91,8 +91,8 @@ def georeference(centers: Array, places: Array, metric: bool) -> tuple[Similarit
     Bolles 1981, then least squares on what agrees). Returns in words why there is none where that is so.
     """
     known = np.isfinite(places[:, :2]).all(axis=1)
-    if known.sum() < _LEAST_FIXES:
-        return f"only {int(known.sum())} frames have a place, {_LEAST_FIXES} are needed"
+    if known.sum() < _MIN_FIXES:
+        return f"only {int(known.sum())} frames have a place, {_MIN_FIXES} are needed"
     rough = np.append(np.median(places[known, :2], axis=0), 0.0)
     flat = np.column_stack([places[known, :2], np.zeros(int(known.sum()))])
     target = enu_from_geodetic(flat, rough)[:, :2] @ (1, 1j)
@@ -105,7 +105,7 @@ def georeference(centers: Array, places: Array, metric: bool) -> tuple[Similarit
     span = float(np.abs(target[inside] - target[inside].mean()).max())
     if span < 1e-6:
         return "all places are the same, as of one fix that the device has kept"
-    if span < _LEAST_SPAN * residual:
+    if span < _MIN_SPAN * residual:
         return f"the path spans {2 * span:.1f} m, too little against places that are {residual:.1f} m off"
     scale = abs(turn)
     rotation = np.array([[turn.real, -turn.imag, 0], [turn.imag, turn.real, 0], [0, 0, scale]]) / scale

@@ -31,12 +31,12 @@ from .view import Scene
 _UPRIGHT = np.sin(np.radians(20))
 _CELL = 3.0
 """Voxels on a side of the cells in which things are separated, seen from above."""
-_LEAST_TOP, _LEAST_DOOR = 60, 100
+_MIN_TOP, _MIN_DOOR = 60, 100
 """Voxels of a thing's upper side, and of a door: about 0.1 and 0.16 m² at the usual distance."""
-_MOST_OF_A_KIND = 4
+_MAX_OF_A_KIND = 4
 _OVER_FLOOR = 0.08
 """Whatever is lower than this part of the usual depth is the floor, or on it."""
-_LEAST_LEVEL = 0.2
+_MIN_LEVEL = 0.2
 """Share of a thing's upper side that makes a level."""
 _LENGTH_SD = 0.04
 _WRONG_NAME, _WRONG_SURFACE = 0.3, 0.4
@@ -51,10 +51,10 @@ _MOSTLY = 0.5
 _RISE = 0.6
 """A camera whose height changes by more than this part of itself (80 % of the views) does not stay on one floor."""
 _LEVEL = np.cos(np.radians(25))
-_GROUND_REACH, _GROUND_SD, _LEAST_UNDER, _LEAST_OVER_GROUND = 0.3, 0.15, 20, 0.3
+_GROUND_REACH, _GROUND_SD, _MIN_UNDER, _MIN_OVER_GROUND = 0.3, 0.15, 20, 0.3
 """Ground is within this part of the usual depth around the camera; the height over it is so exact; so many voxels,
 and so large a share of the cameras with some under them, are needed."""
-_LEAST_HEIGHT = 0.05
+_MIN_HEIGHT = 0.05
 """A camera nearer to its floor than this part of the usual depth was put on it: its height says nothing."""
 
 
@@ -77,10 +77,10 @@ def camera_height(scene: Scene) -> list[Evidence]:
     length_sd = 0.02
     if not stays_on_floor(heights):
         heights, length_sd = over_ground(scene), _GROUND_SD
-        if len(heights) < _LEAST_OVER_GROUND * len(scene.centres):
+        if len(heights) < _MIN_OVER_GROUND * len(scene.centres):
             return []
     height = float(np.median(heights))
-    if height < _LEAST_HEIGHT * scene.median_depth:
+    if height < _MIN_HEIGHT * scene.median_depth:
         return []
     held = measured("floor height", "camera height", height, CAMERA_OVER_FLOOR, length_sd=length_sd)
     table_metres, table_sd = CAMERA_OVER_TABLE
@@ -113,7 +113,7 @@ def over_ground(scene: Scene) -> Array:
         depth = -(from_camera @ up)
         sideways = np.linalg.norm(from_camera + depth[:, None] * up, axis=1)
         under = depth[(sideways < reach) & (depth > 0)]
-        if len(under) >= _LEAST_UNDER:
+        if len(under) >= _MIN_UNDER:
             heights.append(float(np.quantile(under, 0.6)))
     return np.array(heights)
 
@@ -152,14 +152,14 @@ def _tops(scene: Scene, heights: Array, upward: Array) -> list[Evidence]:
     above &= ~disputed(scene.label, scene.names, scene.voxels)
     known: dict[str, list[tuple[float, Sizes]]] = defaultdict(list)
     for name, (told, sizes) in TOPS.items():
-        for members in _instances(scene, above & scene.named((name,)), _LEAST_TOP):
+        for members in _instances(scene, above & scene.named((name,)), _MIN_TOP):
             found = _levels(scene, heights, members)
             if found:
                 known[told].append((found[0], sizes))
     return [
         measured(told, told, height, sizes, wrong=_WRONG_NAME, length_sd=_LENGTH_SD)
         for told, things in known.items()
-        for height, sizes in things[:_MOST_OF_A_KIND]
+        for height, sizes in things[:_MAX_OF_A_KIND]
     ]
 
 
@@ -167,7 +167,7 @@ def _doors(scene: Scene, heights: Array, upward: Array) -> list[Evidence]:
     """Upper ends of upright surfaces that are called doors and begin at the floor."""
     upright = (np.abs(upward) < _UPRIGHT) & scene.named(DOORS)
     found = []
-    for members in _instances(scene, upright, _LEAST_DOOR)[:_MOST_OF_A_KIND]:
+    for members in _instances(scene, upright, _MIN_DOOR)[:_MAX_OF_A_KIND]:
         low, high = np.quantile(heights[members], [0.03, 0.97])
         if high > 0 and low < 0.15 * high:  # a mirror shows doors under the floor too
             found.append(measured("door", "door", float(high), DOOR, wrong=_WRONG_NAME, length_sd=0.06))
@@ -177,12 +177,12 @@ def _doors(scene: Scene, heights: Array, upward: Array) -> list[Evidence]:
 def _surfaces(scene: Scene, heights: Array) -> list[Evidence]:
     """Level surfaces over the floor where nothing has a name: all together, as one kind."""
     members = scene.kind == UNNAMED
-    if members.sum() < _LEAST_TOP:
+    if members.sum() < _MIN_TOP:
         return []
     found = _levels(scene, heights, members)
     return [
         measured("level surface", "surface", height, SURFACE, wrong=_WRONG_SURFACE, length_sd=_LENGTH_SD)
-        for height in found[:_MOST_OF_A_KIND]
+        for height in found[:_MAX_OF_A_KIND]
         if height > _OVER_FLOOR * scene.median_depth
     ]
 
@@ -190,7 +190,7 @@ def _surfaces(scene: Scene, heights: Array) -> list[Evidence]:
 def _levels(scene: Scene, heights: Array, members: NDArray) -> list[float]:
     """Heights with many of these voxels, most first."""
     weight = scene.voxels.weight[members]
-    return levels(heights[members], weight / weight.sum(), scene.voxels.size, _LEAST_LEVEL)
+    return levels(heights[members], weight / weight.sum(), scene.voxels.size, _MIN_LEVEL)
 
 
 def _instances(scene: Scene, members: NDArray[np.bool_], least: int) -> list[NDArray[np.int64]]:

@@ -16,8 +16,8 @@ from .heights import camera_height, ceiling_height, sizes_of_things, usual_dista
 from .network import MEASURED, known_scale, network_scale
 from .view import Scene, SeenFrame, build_scene
 
-_MOST_FRAMES = 40
-_MOST_NETWORK_FRAMES = 24
+_MAX_FRAMES = 40
+_MAX_NETWORK_FRAMES = 24
 _CONTRADICTION = 3.0
 _OUTDOORS_SHARE = 0.2
 """Share of an image, in the middle of all, that shows sky or open ground; through windows it is less. A judgement, not
@@ -97,7 +97,7 @@ def usual_evidence(seen: Seen, card: Card | None, threads: int = 1, device: str 
         return []
     pieces = scene_evidence(scene)
     if card is not None:
-        some = seen.frames[:: -(-len(seen.frames) // _MOST_NETWORK_FRAMES)]
+        some = seen.frames[:: -(-len(seen.frames) // _MAX_NETWORK_FRAMES)]
         found = network_scale(card, some, seen.camera, threads, device)
         pieces += [found] if found else []
     return pieces
@@ -116,7 +116,7 @@ def load_seen(run: RunFolder, trajectory: Trajectory) -> Seen:
     keys = np.flatnonzero(trajectory.is_keyframe)
     rows = [int(k) for k in keys if run.holds(PROXY_MAPS, of=int(trajectory.frame_ids[k]))]
     frames, frame_ids = [], []
-    for row in rows[:: max(1, -(-len(rows) // _MOST_FRAMES))]:
+    for row in rows[:: max(1, -(-len(rows) // _MAX_FRAMES))]:
         frame_id = int(trajectory.frame_ids[row])
         maps = fields.in_world(frame_id, run.load(PROXY_MAPS, of=frame_id))
         frames.append(SeenFrame(run.image(frame_of[frame_id]), maps, trajectory.world_from_cam[row]))

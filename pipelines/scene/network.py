@@ -13,14 +13,14 @@ from ..networks.depth import network_depth
 from ..networks.session import Letterbox, Network
 from ..types import Intrinsics
 from .evidence import Evidence, Mode
-from .view import LEAST_CONFIDENCE, SeenFrame
+from .view import MIN_CONFIDENCE, SeenFrame
 
 _SENSOR_SD = 0.02
 """Depth cameras: 1 to 3 % at room distances after the factory's calibration (Khoshelham and Oude Elberink, Sensors
 2012, for the Kinect)."""
 _SENSOR_SPREAD = 0.02
 """Depth that strays more than this from the triangulated points, relatively, is no sensor's."""
-_LEAST_SD = 0.003
+_MIN_SD = 0.003
 MEASURED = "measured"
 """Kind of what somebody has measured: a length that the user knows, a depth camera."""
 
@@ -34,7 +34,7 @@ LARGE_SD = 0.10
 """Metric3D-V2 and MoGe-2: zero-shot AbsRel of 6 to 10 % on indoor sets (their papers), of which much is the scale."""
 _ZOOMS = (1.0, 1.25, 1.5)
 """FastDepth was trained on images enlarged by 1 to 1.5, depth divided by as much: each is as good an answer."""
-_LEAST_PIXELS = 1500
+_MIN_PIXELS = 1500
 _INDEPENDENT = 6
 """Neighbouring views err alike: the median of many counts as that of so few at most."""
 
@@ -89,7 +89,7 @@ def log_ratio(network: Network, frame: SeenFrame, camera: Intrinsics, zoom: floa
     metres = np.asarray(output, np.float64).reshape(rows, columns)
     low, high = network.card.valid
     depth = retake_nearest(frame.maps.depth, camera, own)
-    sure = retake_nearest(frame.maps.confidence, camera, own) >= LEAST_CONFIDENCE
+    sure = retake_nearest(frame.maps.confidence, camera, own) >= MIN_CONFIDENCE
     return _median_log(np.where((metres > low) & (metres < high), metres * zoom, 0), np.where(sure, depth, 0))
 
 
@@ -99,12 +99,12 @@ def _plain(network: Network, frame: SeenFrame, camera: Intrinsics) -> float | No
     height, width = maps.depth.shape
     image = np.asarray(cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     found = network_depth(network, image, camera.resized(width, height))
-    return _median_log(found.depth.astype(np.float64), np.where(maps.confidence >= LEAST_CONFIDENCE, maps.depth, 0))
+    return _median_log(found.depth.astype(np.float64), np.where(maps.confidence >= MIN_CONFIDENCE, maps.depth, 0))
 
 
 def _median_log(metres: Array, depth: Array) -> float | None:
     both = (metres > 0) & (depth > 0)
-    return float(np.median(np.log(metres[both] / depth[both]))) if both.sum() >= _LEAST_PIXELS else None
+    return float(np.median(np.log(metres[both] / depth[both]))) if both.sum() >= _MIN_PIXELS else None
 
 
 def retake(image: NDArray[np.uint8], camera: Intrinsics, other: Intrinsics) -> NDArray[np.uint8]:
@@ -140,7 +140,7 @@ def known_scale(report: Mapping[str, Any], spreads: list[float], statistical_sd:
     if not report.get("metric"):
         return []
     if report.get("scale_from") == "reference":
-        sd = max(float(report["reference_relative_sd"]), _LEAST_SD)
+        sd = max(float(report["reference_relative_sd"]), _MIN_SD)
         return [Evidence("the given reference", MEASURED, (Mode(0.0, sd),), 0.0, is_guess=False)]
     name = str(report.get("depth", "depth"))
     is_sensor = name.startswith("files") and (not spreads or float(np.median(spreads)) < _SENSOR_SPREAD)

@@ -17,11 +17,11 @@ from ..geometry.posed_depth import PosedDepth
 from ..geometry.room_layout import Gravity, find_gravity, floor_plane, name_structure
 from ..geometry.voxels import VOXELS_PER_DEPTH, Voxels, gather_depths
 from ..mapping.measure import depth_view
-from ..outcome import Outcome, evenly, maps_around
+from ..outcome import Outcome, maps_around, spread_sample
 from ..system.parallel import abreast, parallel_map
 from ..types import Intrinsics
 
-_LEAST_LENGTH = 0.05
+_MIN_LENGTH = 0.05
 """Shorter segments, as a share of the image's long side, have no reliable direction."""
 _REACH = 35.0
 _PRIOR_SD = 15.0
@@ -30,8 +30,8 @@ open. The prior chooses among the directions of a room, it does not bend the one
 _COARSE_SD = 1.5
 _SDS = (2.0, 1.0, 0.7, 0.5, 0.5, 0.5)
 _INSIDE = 1.0
-_LEAST_LINES = 40
-_LEAST_CONTRAST = 3.0
+_MIN_LINES = 40
+_MIN_CONTRAST = 3.0
 
 Array = NDArray[np.float64]
 
@@ -72,11 +72,11 @@ def find_upright(outcome: Outcome) -> Upright:
     """
     trajectory = outcome.trajectory
     prior = cameras_up(trajectory.world_from_cam[trajectory.is_posed])
-    rows = evenly(np.flatnonzero(trajectory.is_keyframe).tolist(), _PICTURES)
+    rows = spread_sample(np.flatnonzero(trajectory.is_keyframe).tolist(), _PICTURES)
     poses = trajectory.cam_from_world[rows]
     pictures = (outcome.run.image(outcome.frames[row]) for row in rows)
     lines = up_of_lines(pictures, poses, outcome.calibration.intrinsics, prior, get_threads())
-    voxels = surface_voxels(outcome, evenly(rows, _VIEWS))
+    voxels = surface_voxels(outcome, spread_sample(rows, _VIEWS))
     level = find_gravity(voxels, prior) if len(voxels) else Gravity(prior, False)
     if not (lines.is_sure or level.is_sure):
         return Upright(prior, "", None)
@@ -129,7 +129,7 @@ class Vertical:
     @property
     def is_sure(self) -> bool:
         """Far more lines are vertical than chance would have it."""
-        return self.lines >= _LEAST_LINES and self.contrast >= _LEAST_CONTRAST
+        return self.lines >= _MIN_LINES and self.contrast >= _MIN_CONTRAST
 
 
 def line_planes(picture: NDArray[np.uint8], intrinsics: Intrinsics) -> tuple[Array, Array]:
@@ -145,7 +145,7 @@ def line_planes(picture: NDArray[np.uint8], intrinsics: Intrinsics) -> tuple[Arr
     # OpenCV counts from the centre of the first pixel.
     ends = np.asarray(found, np.float64).reshape(-1, 2, 2) + 0.5
     lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / side
-    ends, lengths = ends[lengths > _LEAST_LENGTH], lengths[lengths > _LEAST_LENGTH]
+    ends, lengths = ends[lengths > _MIN_LENGTH], lengths[lengths > _MIN_LENGTH]
     k = intrinsics
     rays = np.concatenate([(ends - (k.cx, k.cy)) / (k.fx, k.fy), np.ones((len(ends), 2, 1))], axis=2)
     normals = np.cross(rays[:, 0], rays[:, 1])

@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 from ..geometry.camera import resize_maps, unproject_depth
 from ..geometry.room_layout import CEILING, FLOOR, FloorPlane, Gravity, find_gravity, floor_plane, name_structure
-from ..geometry.voxels import LEAST_WEIGHT, VOXELS_PER_DEPTH, Voxels, find, gather_frame, merge, voxel_keys
+from ..geometry.voxels import MIN_WEIGHT, VOXELS_PER_DEPTH, Voxels, find, gather_frame, merge, voxel_keys
 from ..providers import resize_area
 from ..types import VOID, Intrinsics, ProxyMaps
 
 Array = NDArray[np.float64]
 
-LEAST_CONFIDENCE = 0.3
+MIN_CONFIDENCE = 0.3
 _SIDE = 200
-_LEAST_PLANE = 30
+_MIN_PLANE = 30
 """Voxels without which a floor or a ceiling is none."""
 
 
@@ -52,7 +52,7 @@ class Scene:
 
     def plane(self, kind: int) -> FloorPlane | None:
         """Fit the plane of the floor or the ceiling; None where too little of it was seen."""
-        if (self.kind == kind).sum() < _LEAST_PLANE:
+        if (self.kind == kind).sum() < _MIN_PLANE:
             return None
         return floor_plane(self.voxels, self.kind, self.gravity.up, kind)
 
@@ -69,7 +69,7 @@ def build_scene(
     frames: Sequence[SeenFrame], intrinsics: Intrinsics, names: tuple[str, ...], is_named: bool
 ) -> Scene | None:
     """The scene of some keyframes; None where none of them has reliable depth."""
-    known = [f.maps.depth[(f.maps.depth > 0) & (f.maps.confidence >= LEAST_CONFIDENCE)][::7] for f in frames]
+    known = [f.maps.depth[(f.maps.depth > 0) & (f.maps.confidence >= MIN_CONFIDENCE)][::7] for f in frames]
     if not sum(map(len, known)):
         return None
     median_depth = float(np.median(np.concatenate(known)))
@@ -77,7 +77,7 @@ def build_scene(
     camera = intrinsics.at_most(_SIDE)
     rows = [_gather(f, camera, size) for f in frames]
     # Votes are by the same cubes, however many.
-    voxels = merge(size, [(keys, values) for keys, values, _ in rows], sys.maxsize, LEAST_WEIGHT)
+    voxels = merge(size, [(keys, values) for keys, values, _ in rows], sys.maxsize, MIN_WEIGHT)
     cameras = np.array([f.world_from_cam for f in frames])
     gravity = find_gravity(voxels, -cameras[:, :3, 1].mean(0))
     kind = name_structure(voxels, gravity, cameras[:, :3, 3])
@@ -91,7 +91,7 @@ def _gather(
     """The frame's voxels as `gather_frame` gives them, and (Q,) key and label of each of its reliable pixels."""
     rows, columns = camera.height, camera.width
     maps = resize_maps(frame.maps, rows, columns)
-    depth, labels, sure = maps.depth, maps.labels, maps.confidence >= LEAST_CONFIDENCE
+    depth, labels, sure = maps.depth, maps.labels, maps.confidence >= MIN_CONFIDENCE
     weight = np.where(sure, maps.confidence, 0).astype(np.float32)
     image = resize_area(frame.image, columns, rows)
     keys, values = gather_frame(depth, weight, image, camera, frame.world_from_cam, size)

@@ -22,7 +22,7 @@ CORRELATED, _SIGNIFICANT = 5.0, 3.0
 """By how much deviations of the camera exceed those of independent errors: features of one corner repeat theirs, and
 rolling shutter and blur are no noise (2 to 9 times in rendered rooms). And from how many deviations on a radial
 coefficient is one: 0.02 to 0.9 where there is none, from 2.6 on for a k1 of 0.05."""
-_LEAST_NOISE = 1e-6
+_MIN_NOISE = 1e-6
 """Pixels: of a model without any, so that a covariance can be inverted."""
 _FINE, _ROUGH = 1e-6, 1e-4
 """An adjustment ends with a step that lowers the cost by less, relatively."""
@@ -161,7 +161,7 @@ def _lens_covariance(model: pycolmap.Reconstruction, adjuster: pycolmap.CeresBun
     if block is None or not np.isfinite(block).all() or not (np.diag(block) > 0).all():
         return np.diag([camera.focal_length**2, 1.0, 1.0])
     # The adjustment counts with residuals of one pixel a coordinate; the median norm of two is 1.18 of them.
-    return np.asarray(block) * (max(median_error(model), _LEAST_NOISE) / 1.1774) ** 2
+    return np.asarray(block) * (max(median_error(model), _MIN_NOISE) / 1.1774) ** 2
 
 
 def focals_of_halves(model: pycolmap.Reconstruction) -> list[tuple[float, float]]:

@@ -18,12 +18,12 @@ from .flow import corners, follow
 from .matching import VerifiedPair
 from .snapshots import Snapshots, features_name, pairs_name
 
-LEAST = 100
+MIN_SHARED = 100
 """Features matched on both sides below which a keyframe is a weak one. On a made-up walk, steps beyond keyframes with
 15 to 45 of them change by 1 to 8 %; the weakest of six recordings have 330 and more, of two others next to none."""
-_MOST, _DISTANCE = 1000, 3.0
+_MAX_CORNERS, _DISTANCE = 1000, 3.0
 """Corners of an image, and pixels between them."""
-_LEAST_GUESS, _GUESS_ERROR = 8, 0.03
+_MIN_GUESS, _GUESS_ERROR = 8, 0.03
 """Matches for a first guess of where corners go, a homography, and their error, as a share of the image's width."""
 
 Array = NDArray[np.float64]
@@ -32,8 +32,8 @@ Picture = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
 
 
 def weakly_connected(pairs: Sequence[VerifiedPair], count: int, reach: int) -> list[int]:
-    """Keyframes that match both neighbours, and of whose features fewer than LEAST are matched with keyframes at most
-    `reach` before as well as with such behind them."""
+    """Find keyframes that match both neighbours, and of whose features fewer than MIN_SHARED are matched with keyframes
+    at most `reach` before as well as with such behind them."""
     before: list[list[NDArray[np.uint32]]] = [[] for _ in range(count)]
     behind: list[list[NDArray[np.uint32]]] = [[] for _ in range(count)]
     for pair in pairs:
@@ -45,7 +45,7 @@ def weakly_connected(pairs: Sequence[VerifiedPair], count: int, reach: int) -> l
     def ties(k: int) -> int:
         return len(np.intersect1d(np.concatenate(before[k]), np.concatenate(behind[k])))
 
-    return [k for k in range(1, count - 1) if {k - 1, k} <= steps and ties(k) < LEAST]
+    return [k for k in range(1, count - 1) if {k - 1, k} <= steps and ties(k) < MIN_SHARED]
 
 
 def with_bridges(
@@ -108,7 +108,7 @@ def _followed(
 ) -> list[Array]:
     """Pixels (Q, 2) of corners of the middle image that are found in both others, in each of the three."""
     (first, hidden_first), (middle, hidden), (last, hidden_last) = pictures
-    xy = corners(middle, np.zeros((0, 2)), _MOST, _DISTANCE, hidden)
+    xy = corners(middle, np.zeros((0, 2)), _MAX_CORNERS, _DISTANCE, hidden)
     there, seen = [], np.ones(len(xy), np.bool_)
     sides = (
         (first, hidden_first, features[0], before.matches[:, ::-1]),
@@ -128,7 +128,7 @@ def _followed(
 def _guess(source: Array, target: Array, xy: Array, width: int) -> Array:
     """(Q, 2) where points are about, by the homography of most matches: what far things do, and turns."""
     nowhere = np.full_like(xy, np.nan)
-    if len(source) < _LEAST_GUESS:
+    if len(source) < _MIN_GUESS:
         return nowhere
     homography, _ = cv2.findHomography(source, target, cv2.USAC_MAGSAC, _GUESS_ERROR * width)
     if homography is None or len(xy) == 0:

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 DENSE_CAMERAS = 250
 """Up to so many a dense factorisation of the reduced system is faster than a sparse one."""
-_LEAST_GAIN = 1e-5
+_MIN_GAIN = 1e-5
 """An adjustment ends with a step that lowers the cost by less, relatively."""
 
 
@@ -142,7 +142,7 @@ def adjust_bundle(
             break
         gain, cost, motions, points = (cost - tried) / cost, tried, moved, shifted
         damping = max(damping / 5, 1e-8)
-        if gain < _LEAST_GAIN:
+        if gain < _MIN_GAIN:
             break
     return Adjusted(replace(bundle, cam_from_world=motions, points=points), initial, cost, done)
 

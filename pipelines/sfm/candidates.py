@@ -23,8 +23,8 @@ from ..system.progress import Progress
 from ..types import Features
 from .adjust import CAUCHY_PX, LOSS_SD, adjust, filter_outliers, solve
 from .consistency import (
-    LEAST_BETTER,
-    LEAST_GAIN_OF_FREEING,
+    MIN_BETTER,
+    MIN_GAIN_OF_FREEING,
     ModelReport,
     gain_of_freeing,
     judge,
@@ -101,7 +101,7 @@ def _better(
     and as many of the views."""
     if first is None or second is None:
         return first or second
-    left = unexplained(second.model, pairs, views.xy) < (1 - LEAST_BETTER) * unexplained(first.model, pairs, views.xy)
+    left = unexplained(second.model, pairs, views.xy) < (1 - MIN_BETTER) * unexplained(first.model, pairs, views.xy)
     return second if left and second.score >= _AS_GOOD * first.score else first
 
 
@@ -131,7 +131,7 @@ class Candidates:
             return held
         if held is not None:
             straight = straight_copy(held.model, views.xy, views.times, held.readout)
-            if gain_of_freeing(straight) < LEAST_GAIN_OF_FREEING:
+            if gain_of_freeing(straight) < MIN_GAIN_OF_FREEING:
                 return held
         free = next(filter(None, (self._freed(name, views, pairs) for name in ("stated", "unknown"))), None)
         return _better(held, free, views, pairs)

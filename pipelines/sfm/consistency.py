@@ -22,16 +22,16 @@ from .seams import (
     worst_contradictions,
 )
 
-LEAST_GAIN_OF_FREEING = 0.03
+MIN_GAIN_OF_FREEING = 0.03
 """Of the cost that must go. Freed, a Kinect's calibration explained 0.013 more of a recording with rolling shutter and
 blur, another Kinect's nominal 525 px 0.057."""
-LEAST_BETTER = 0.01
+MIN_BETTER = 0.01
 """By how much less of the matches the model of the camera found anew must leave unexplained to be taken."""
 _FARTHEST_PX = 100.0
 """Errors count at most as much as this: of false matches nobody knows how wrong they are."""
 
 _AGREE_PX = 4.0
-_MOST_MISPLACED = 0.2
+_MAX_MISPLACED = 0.2
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def without_misplaced(
 ) -> pycolmap.Reconstruction:
     """The model, keyframes that their neighbours contradict taken out of it in place; arguments as of `judge`."""
     misplaced = find_misplaced(check_pairs(model, pairs, xy, total), reach)
-    if 0 < len(misplaced) <= _MOST_MISPLACED * model.num_reg_frames():  # of more, who knows which are right
+    if 0 < len(misplaced) <= _MAX_MISPLACED * model.num_reg_frames():  # of more, who knows which are right
         remove_keyframes(model, misplaced)
     return model
 

@@ -34,7 +34,7 @@ _BENDS, _BETWEEN = (-0.3, -0.2, -0.1, 0.1), 0.05
 """Of a pixel at a corner of the image, by how much farther in or out it would be without distortion."""
 _WIDE = 12
 """So many of the focal lengths are those of lenses that bend: up to 1.5 longer sides."""
-_LEAST_GAIN = 0.02
+_MIN_GAIN = 0.02
 """Share of the cost that a bend must explain to be one."""
 _UNCALIBRATED = int(pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED)
 _CALIBRATED = int(pycolmap.TwoViewGeometryConfiguration.CALIBRATED)
@@ -81,7 +81,7 @@ def two_view_lens(
     straight = costs(0.0, range(len(focals)))
     found = {bend: costs(bend, wide) for bend in _BENDS}
     best = min(found, key=lambda bend: found[bend].min())
-    if found[best].min() > (1 - _LEAST_GAIN) * straight.min():
+    if found[best].min() > (1 - _MIN_GAIN) * straight.min():
         return _vertex(straight, focals), 0.0
     found |= {bend: costs(bend, wide) for bend in (best - _BETWEEN, best + _BETWEEN)}
     best = min(found, key=lambda bend: found[bend].min())

@@ -13,7 +13,7 @@ from ..geometry.se3 import Similarity, best_rotation
 from .adjust import filter_outliers, median_error, solve
 from .consistency import unexplained
 from .matching import VerifiedPair
-from .seams import LEAST_POINTS, remove_keyframes
+from .seams import MIN_POINTS, remove_keyframes
 
 _LEFT_OUT_PX = 8.0
 """Median errors within which an observation belongs to a point, at most COLMAP's own limits. Of half, once and twice as
@@ -28,7 +28,7 @@ _FOCALS = np.geomspace(0.4, 3.0, 41)
 _ROUNDS = 20
 _FAR_OFF = 5.0
 """Standard deviations from which a given pose is wrong altogether."""
-_LEAST_SD = 1e-6
+_MIN_SD = 1e-6
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def agreement(found: Array, given: Array) -> Agreement | None:
     ours, theirs = se3.inverse(found), se3.inverse(given)
     # Started without far outliers: a pose in another town would turn the first fit round.
     apart = np.linalg.norm(theirs[:, :3, 3] - np.median(theirs[:, :3, 3], axis=0), axis=1)
-    weight = 1 / (1 + (apart / max(3 * float(np.median(apart)), _LEAST_SD)) ** 2)
+    weight = 1 / (1 + (apart / max(3 * float(np.median(apart)), _MIN_SD)) ** 2)
     for _ in range(_ROUNDS):
         axes = np.repeat(weight, 3)[:, None]
         rotation = best_rotation(axes * ours[:, :3, :3].transpose(0, 2, 1).reshape(-1, 3),
@@ -64,9 +64,9 @@ def agreement(found: Array, given: Array) -> Agreement | None:
             return None
         away = np.linalg.norm(scale * a - b, axis=1)
         turned = np.degrees(se3.rotation_angle(_turns(ours, theirs, rotation)))
-        sds = [max(float(np.median(x)) / 1.54, _LEAST_SD) for x in (away, turned)]  # the median norm of three
+        sds = [max(float(np.median(x)) / 1.54, _MIN_SD) for x in (away, turned)]  # the median norm of three
         weight = 1 / (1 + (away / sds[0] / 3) ** 2 + (turned / sds[1] / 3) ** 2)
-    wrong = (away > _FAR_OFF * sds[0] + _LEAST_SD) | (turned > _FAR_OFF * sds[1] + _LEAST_SD)
+    wrong = (away > _FAR_OFF * sds[0] + _MIN_SD) | (turned > _FAR_OFF * sds[1] + _MIN_SD)
     move = Similarity(scale, rotation, mean_b - scale * rotation @ mean_a)
     return Agreement(move, sds[0], sds[1], wrong, sds[0] / max(scale * np.sqrt(spread), 1e-12))
 
@@ -110,7 +110,7 @@ def posed_model(
 def _remove_unheld(model: pycolmap.Reconstruction) -> None:
     """Remove images that see hardly any point, in place: their poses are still the given ones, and COLMAP's mappers
     cannot add to a model with an image that no match ties to another."""
-    while unheld := [i - 1 for i in sorted(model.reg_image_ids()) if model.images[i].num_points3D < LEAST_POINTS]:
+    while unheld := [i - 1 for i in sorted(model.reg_image_ids()) if model.images[i].num_points3D < MIN_POINTS]:
         remove_keyframes(model, unheld)
 
 

@@ -15,7 +15,7 @@ _BORDER_POINTS = 65
 _FOCAL_ROUNDS = 6
 FOCAL_GUESS = 1.2
 """Focal length in longer sides of the image where it is unknown."""
-_LEAST_SHIFT_PX = 0.3
+_MIN_SHIFT_PX = 0.3
 
 
 def to_pycolmap(camera: Camera) -> pycolmap.Camera:
@@ -93,7 +93,7 @@ class Lens:
     @property
     def is_straight(self) -> bool:
         """Whether there is too little distortion to take away."""
-        return self.shift_px <= _LEAST_SHIFT_PX
+        return self.shift_px <= _MIN_SHIFT_PX
 
     def undistort_points(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
         """(M, 2) pixels of the source to pixels of the pinhole."""

@@ -20,7 +20,7 @@ _MAX_ERROR, MIN_INLIERS = 2.0, 15
 """Pixels within which a match obeys a geometry, and how many have to."""
 _ABREAST = 32
 """Columns that are compared side by side: two vectors of the widest there are."""
-_LEAST = -(2**24)
+_BELOW_ALL = -(2**24)
 """Below all products of descriptors, which are whole numbers that a float has exactly."""
 _ROWS = 512
 """Of the table of all products: with as many columns as an image has features they stay in the cache."""
@@ -68,8 +68,8 @@ def _two_nearest(
     nearest row. Of equal ones the first. Both kinds of product give the same."""
     table, of_row, of_column = (_byte_products if _has_byte_products() else _float_products)(first, second)
     rows, columns = len(first), len(second)
-    found = np.zeros(rows, np.int64), *np.full((2, rows), _LEAST, np.float32)
-    back = np.full(columns, _LEAST, of_column.dtype), np.zeros(columns, np.int32)
+    found = np.zeros(rows, np.int64), *np.full((2, rows), _BELOW_ALL, np.float32)
+    back = np.full(columns, _BELOW_ALL, of_column.dtype), np.zeros(columns, np.int32)
     for start in range(0, rows, _ROWS):
         part = slice(start, start + _ROWS)
         _look(table(part), start, of_row[part], of_column, *(values[part] for values in found), *back)
@@ -117,7 +117,7 @@ def _look(table, start, of_row, of_column, best, score, runner_up, column_score,
     become vector instructions.
     """
     rows, columns = table.shape
-    least = of_column.dtype.type(_LEAST)
+    least = of_column.dtype.type(_BELOW_ALL)
     tops, seconds = np.empty((2, _ABREAST), of_column.dtype)
     places = np.empty(_ABREAST, np.int32)
     whole = columns - columns % _ABREAST

@@ -17,7 +17,7 @@ _MOVING_FRACTION = 0.01
 _TURN_ONLY_PX = 1.5
 _MIN_DISPLACEMENT_PX = 10.0
 _SAMPLED_PAIRS = 40
-_MOST_MATCH = 0.9
+_MAX_MATCH = 0.9
 _COARSE_FOCALS = np.geomspace(0.4, 4.0, 13)
 _FINE_FACTORS = np.geomspace(0.85, 1.18, 9)
 
@@ -58,7 +58,7 @@ def require_parallax(
 def why_no_structure(views: int, pairs: Sequence[VerifiedPair]) -> str:
     """Say what may be wrong where no model was found of so many views, and what the matching pairs rule out."""
     matched = len({view for pair in pairs for view in (pair.first, pair.second)})
-    if matched < _MOST_MATCH * views:
+    if matched < _MAX_MATCH * views:
         return (
             f"no structure could be found among {views} views; pairs that match: {len(pairs)}. {views - matched} views "
             "match no other. Possible causes: too little overlap, plain surfaces, blur, darkness, or things that move. "

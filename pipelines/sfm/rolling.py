@@ -31,9 +31,9 @@ NO_READOUT = (0.0, 0.0)
 
 LONGEST_STEP = 1.0
 """Seconds: frames farther apart say nothing about the camera's velocity at either."""
-LEAST_STEP = 1e-4
+MIN_STEP = 1e-4
 """Seconds: frames of nearly one time (duplicated or repaired timestamps) make a derivative of noise alone."""
-LEAST_GAIN = 0.01
+MIN_GAIN = 0.01
 """Share of the robust cost that a readout must explain. Of three cameras that take all rows at once it was less than
 0.00002, of a phone that holds still 0.001; of a Kinect 0.03 at first and 0.054 in the end."""
 REACH = (-2, -1, 1, 2)
@@ -72,7 +72,7 @@ def read_readout(text: str) -> Readout | None:
 def velocities(cam_from_world: Array, times: Array, worlds: NDArray[np.int64] | None = None) -> Array:
     """(N, 6) twists a second of cameras (N, 4, 4) in order, at times (N,): the derivative of the polynomial through the
     poses of up to two frames before and two after. Frames more than LONGEST_STEP away, or in another of the `worlds`
-    (N,), or of a clock that was set back, or within LEAST_STEP of the frame between or of this one, do not count;
+    (N,), or of a clock that was set back, or within MIN_STEP of the frame between or of this one, do not count;
     without any the velocity is zero."""
     count = len(times)
     steps, twists = np.zeros((len(REACH), count)), np.zeros((len(REACH), count, 6))
@@ -80,9 +80,7 @@ def velocities(cam_from_world: Array, times: Array, worlds: NDArray[np.int64] | 
         here = np.arange(max(0, -offset), count - max(0, offset))
         apart = (times[here + offset] - times[here]) * np.sign(offset)
         nearer = here + offset - np.sign(offset)
-        known = (
-            (apart >= LEAST_STEP) & (apart <= LONGEST_STEP) & (abs(times[here + offset] - times[nearer]) >= LEAST_STEP)
-        )
+        known = (apart >= MIN_STEP) & (apart <= LONGEST_STEP) & (abs(times[here + offset] - times[nearer]) >= MIN_STEP)
         if worlds is not None:
             known &= worlds[here + offset] == worlds[here]
         here = here[known]
@@ -217,7 +215,7 @@ def adjust_rolling(
             ((estimate(*seen, rolling.times, axis), axis) for axis in ((1.0, 0.0), (0.0, 1.0))),
             key=lambda f: f[0][0] ** 2 * f[0][1],
         )
-        if seconds**2 * share < LEAST_GAIN:
+        if seconds**2 * share < MIN_GAIN:
             return None
     else:
         seconds = math.hypot(*readout)
@@ -229,7 +227,7 @@ def adjust_rolling(
         if readout is None:
             step, share = estimate(*seen, rolling.times, axis)
             seconds += step
-    if readout is None and seconds**2 * share < LEAST_GAIN:
+    if readout is None and seconds**2 * share < MIN_GAIN:
         return None
     found = axis[0] * seconds, axis[1] * seconds
     rolling.straighten(*seen, found)

@@ -16,9 +16,9 @@ from .adjust import filter_outliers, solve
 from .consistency import ModelReport, judge
 from .given import complete_tracks
 from .matching import VerifiedPair
-from .seams import LEAST_POINTS, parts_of, tracks_of
+from .seams import MIN_POINTS, parts_of, tracks_of
 
-_LEAST_ANGLE = 0.01
+_MIN_ANGLE = 0.01
 """Radians between the rays of two cameras below which they give no depth."""
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ def mended(
             continue  # a loop holds the two sides
         for shared in sorted((seam.before, seam.after), key=_ties(model, total, reach)):
             ratio, count = size_ratio(model, shared, pairs, xy, reach)
-            if count < LEAST_POINTS:
+            if count < MIN_POINTS:
                 continue
             tried = pycolmap.Reconstruction(model)
             resize_behind(tried, shared, ratio)
@@ -85,7 +85,7 @@ def size_ratio(
         away, wide = _depths(motion, rays[keyframe][features], there)
         better = (away > 0) & (wide > angle[side, features])
         depth[side, features[better]], angle[side, features[better]] = away[better], wide[better]
-    both = (angle > _LEAST_ANGLE).all(0)
+    both = (angle > _MIN_ANGLE).all(0)
     ratio = np.log(depth[0, both] / depth[1, both])
     return (float(np.exp(np.median(ratio))), int(both.sum())) if both.any() else (1.0, 0)
 

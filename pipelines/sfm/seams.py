@@ -13,8 +13,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-LEAST_POINTS = 12
-_LEAST_PAIRS = 3
+MIN_POINTS = 12
+_MIN_PAIRS = 3
 _PAIR_AGREES = 0.5
 
 
@@ -54,12 +54,12 @@ class Seam:
     @property
     def is_weak_link(self) -> bool:
         """Too few points for a pose and a scale of one side from the other."""
-        return self.points < LEAST_POINTS
+        return self.points < MIN_POINTS
 
     @property
     def is_contradicted(self) -> bool:
         """The images on the two sides match, and contradict their poses."""
-        return self.pairs >= _LEAST_PAIRS and self.agreement < _PAIR_AGREES
+        return self.pairs >= _MIN_PAIRS and self.agreement < _PAIR_AGREES
 
 
 def find_seams(
@@ -131,7 +131,7 @@ def find_misplaced(checks: Iterable[PairCheck], reach: int) -> list[int]:
                 pairs[k] += 1
                 matches[k] += check.matches
                 agreeing[k] += check.matches * check.agrees
-        wrong = [k for k in pairs if pairs[k] >= _LEAST_PAIRS and agreeing[k] < _PAIR_AGREES * matches[k]]
+        wrong = [k for k in pairs if pairs[k] >= _MIN_PAIRS and agreeing[k] < _PAIR_AGREES * matches[k]]
         if not wrong:
             return out
         out.append(min(wrong, key=lambda k: (agreeing[k] / matches[k], k)))
@@ -161,7 +161,7 @@ def find_parts(
             for a, b in product(first, second):
                 shared[min(a, b), max(a, b)] += 1
     label = list(range(number + 1))
-    for a, b in np.argwhere(np.triu(shared, 1) >= 2 * LEAST_POINTS).tolist():
+    for a, b in np.argwhere(np.triu(shared, 1) >= 2 * MIN_POINTS).tolist():
         label = [label[a] if x == label[b] else x for x in label]
     parts: dict[int, list[int]] = {}
     for k in placed:

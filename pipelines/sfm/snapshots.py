@@ -19,7 +19,7 @@ T = TypeVar("T")
 _DATABASE_SHARE = 3
 """Bytes of the database and the models made from it, over those of the features and matches: a guess on the safe
 side."""
-_LEAST_ROOM = 30_000_000
+_MIN_ROOM = 30_000_000
 
 
 def features_name(frame_id: int) -> str:
@@ -79,7 +79,7 @@ class Snapshots:
 
         It is taken for a moment: the free space says nothing about a quota or the largest file allowed.
         """
-        needed = _DATABASE_SHARE * sum(p.stat().st_size for p in self.folder.glob("*/*.npz")) + _LEAST_ROOM
+        needed = _DATABASE_SHARE * sum(p.stat().st_size for p in self.folder.glob("*/*.npz")) + _MIN_ROOM
         place = self.folder / "room.tmp"
         try:
             with place.open("wb") as file:

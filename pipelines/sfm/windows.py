@@ -19,7 +19,7 @@ from .adjust import LOSS_SD, filter_outliers, median_error
 from .bundle import adjust_bundle
 from .given import bare_model
 from .matching import VerifiedPair
-from .rolling import LEAST_GAIN, NO_READOUT, Readout, RollingModel, estimate, rectified_bundle, velocities
+from .rolling import MIN_GAIN, NO_READOUT, Readout, RollingModel, estimate, rectified_bundle, velocities
 from .seams import remove_keyframes
 
 _SUREST_PX = 1e-3
@@ -27,8 +27,8 @@ _SUREST_PX = 1e-3
 
 Array = NDArray[np.float64]
 
-_LEAST_SHARED = 30
-_LEAST_MATCHES, _NEAR, _OUTLIER = 12, 0.05, 3.0
+_MIN_SHARED = 30
+_MIN_MATCHES, _NEAR, _OUTLIER = 12, 0.05, 3.0
 """A loop between windows: its least matches, their median error as a share of the image's width, from where it is
 left to `global_ba`, and how many medians a match may be off. On made-up walks only."""
 _READOUT_ROUNDS = 3
@@ -58,7 +58,7 @@ class Joined:
         both = [i for i in found if i in self.poses]
         move = Similarity(1.0, np.eye(3), np.zeros(3))
         if self.poses:
-            if not both or len(known) < _LEAST_SHARED:
+            if not both or len(known) < _MIN_SHARED:
                 return False
             poses = np.array([found[i] for i in both]), np.array([self.poses[i] for i in both])
             seen = np.array([points[p].xyz for p in known]), np.array([self.points[at] for at in known.values()])
@@ -115,7 +115,7 @@ def close_loops(
         rows = [(int(a), int(b)) for a, b in pair.matches
                 if first.points2D[int(a)].has_point3D() and second.points2D[int(b)].has_point3D()]  # fmt: skip
         ids = [(first.points2D[a].point3D_id, second.points2D[b].point3D_id) for a, b in rows]
-        if len(rows) < _LEAST_MATCHES:
+        if len(rows) < _MIN_MATCHES:
             continue
         points = np.array([model.points3D[p].xyz for p, _ in ids])
         pose = pose_of(second)
@@ -162,7 +162,7 @@ def found_readout(model: pycolmap.Reconstruction, xy: Sequence[Array], times: Ar
         step, share = estimate(straight, plain, pinhole, rolling.times, axis)
         seconds += step
         adjust_together(model, xy, times, (axis[0] * seconds, axis[1] * seconds))
-    if seconds**2 * share >= LEAST_GAIN:
+    if seconds**2 * share >= MIN_GAIN:
         return axis[0] * seconds, axis[1] * seconds
     adjust_together(model, xy, times, NO_READOUT)
     return NO_READOUT

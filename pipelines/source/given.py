@@ -21,10 +21,10 @@ from .opening import FolderSource, VideoSource, Warn
 from .recording import RecordingSource
 
 _HOW = "give fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file that holds them"
-_MOST_NAMED = 8
+_MAX_NAMED = 8
 
 AnySource = VideoSource | FolderSource | RecordingSource
-LEAST = 3
+MIN_POSES = 3
 """Poses that belong to an image, below which a file is taken for one of another recording."""
 
 
@@ -47,7 +47,7 @@ def given_poses(
     else:
         found = _by_order(file, source, frames, config.poses)
     known = np.isfinite(found).all(axis=(1, 2))
-    if known.sum() < min(LEAST, len(frames)):
+    if known.sum() < min(MIN_POSES, len(frames)):
         raise InputError(
             f"--poses {config.poses}: of its {len(file)} poses {known.sum()} belong to frames of {source.path}"
             f"{_examples(file, frames)}. Give the poses of these images"
@@ -169,7 +169,7 @@ def _one_of(cameras: dict[str, Camera], name: str, path: Path) -> Camera:
     if len(set(cameras.values())) == 1 and not name:
         return next(iter(cameras.values()))
     known = [f"{n} ({c.width}x{c.height}, fx {c.fx:.6g})" for n, c in cameras.items()]
-    shown = ", ".join(known[:_MOST_NAMED]) + (", ..." if len(known) > _MOST_NAMED else "")
+    shown = ", ".join(known[:_MAX_NAMED]) + (", ..." if len(known) > _MAX_NAMED else "")
     found = f"no camera {name!r} but" if name else f"{len(known)} cameras that differ:"
     raise InputError(
         f"{path} holds {found} {shown}: name the one that took the images, --intrinsics '{path}#{next(iter(cameras))}'"

@@ -14,7 +14,7 @@ from ...formats.images import Header, read_deep, read_header
 _ALIKE = 1.05
 """Focal lengths that differ by less are one: EXIF rounds to whole millimetres, which are 4 % of 25, and the focus moves
 the lens by 2 to 3 %."""
-_MOST_NAMED = 4
+_MAX_NAMED = 4
 _SAMPLED_IMAGES, _SAMPLED_STEP = 24, 3
 _SPAN_PERCENTILES = 0.5, 99.5
 _LARGEST_16_BIT = 65535
@@ -68,7 +68,7 @@ class Headers:
             )
         cameras = Counter(h.lens.camera for h in self.of.values() if h.lens.camera).most_common()
         if len(cameras) > 1:
-            told = ", ".join(f"{count} by {name}" for name, count in cameras[:_MOST_NAMED])
+            told = ", ".join(f"{count} by {name}" for name, count in cameras[:_MAX_NAMED])
             warn(
                 f"by their EXIF the images were taken with {len(cameras)} cameras ({told}), which are treated as one: "
                 "if their lenses differ, keep the images of one camera together"
@@ -145,8 +145,8 @@ def _require_alike(folder: Path, lenses: Mapping[str, ExifLens], key: _Key, what
         groups[-1].append(name)
     if len(groups) < 2:
         return
-    told = [_told(group, values, what) for group in sorted(groups, key=len, reverse=True)[:_MOST_NAMED]]
-    more = f"; and {len(groups) - _MOST_NAMED} more" if len(groups) > _MOST_NAMED else ""
+    told = [_told(group, values, what) for group in sorted(groups, key=len, reverse=True)[:_MAX_NAMED]]
+    more = f"; and {len(groups) - _MAX_NAMED} more" if len(groups) > _MAX_NAMED else ""
     raise InputError(
         f"by their EXIF the images of {folder} were taken with {len(groups)} lenses or zooms: {'; '.join(told)}{more}. "
         "Keep the images of one lens and zoom together. If the EXIF is wrong, remove it from the images"

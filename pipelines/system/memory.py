@@ -41,14 +41,14 @@ _UNKNOWN_MACHINE = 8_000_000_000
 def submap_size(config: Config, camera: Intrinsics) -> int:
     """Keyframes of a submap: `mapping.submap`, or as many as `run.memory_mb` has room for where that is given; 0 where
     all are mapped at once. What the machine has does not matter: a run is the same on every machine."""
-    most, memory_mb = config.mapping.submap, config.run.memory_mb
-    if not most or not memory_mb:
-        return most
+    limit, memory_mb = config.mapping.submap, config.run.memory_mb
+    if not limit or not memory_mb:
+        return limit
     least, a_million_pixels, _, a_million_gaussians = NEEDS["mapping"]
     small = camera.at_most(config.mapping.max_side)
     pixels = small.width * small.height / 1e6
     room = (1 - VIEWS_SHARE) * memory_mb - least - a_million_pixels * camera.width * camera.height / 1e6
-    return min(most, max(MIN_SUBMAP, int(room / (a_million_gaussians * GAUSSIANS / 1e6 * pixels))))
+    return min(limit, max(MIN_SUBMAP, int(room / (a_million_gaussians * GAUSSIANS / 1e6 * pixels))))
 
 
 def release_free_memory() -> None:

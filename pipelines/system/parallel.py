@@ -44,11 +44,11 @@ def abreast(function: Callable[[T], R], items: Iterable[T], threads: int) -> Ite
 
 
 class Kept(Generic[K, R]):
-    """The values of `make` for the keys asked for last, at most `most` of them; who asks for one that another thread
+    """The values of `make` for the keys asked for last, at most `limit` of them; who asks for one that another thread
     is making waits for it. `make` may ask others of its kind, but not itself in a circle."""
 
-    def __init__(self, make: Callable[[K], R], most: int) -> None:
-        self._make, self._most = make, most
+    def __init__(self, make: Callable[[K], R], limit: int) -> None:
+        self._make, self._limit = make, limit
         self._kept: OrderedDict[K, Future[R]] = OrderedDict()
         self._lock = Lock()
 
@@ -59,7 +59,7 @@ class Kept(Generic[K, R]):
             if value is None:
                 value = self._kept[key] = Future()
             self._kept.move_to_end(key)
-            while len(self._kept) > self._most:
+            while len(self._kept) > self._limit:
                 self._kept.popitem(last=False)
         if is_new:
             self._fill(key, value)

@@ -1,8 +1,10 @@
 """Values as files for any machine, or for going on after an interruption: dataclasses of this program, arrays and plain
 values. Tasks and what they return are kept so, and the snapshots of the stages."""
 
+import functools
 import json
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
@@ -17,7 +19,7 @@ from ...formats.reading import parsing
 from ...formats.tensors import load_arrays, save_arrays
 
 _TREE = "tree"
-_OURS = "msgs_slam.pipelines."
+_OURS, _PIPELINES = "msgs_slam.pipelines.", Path(__file__).parents[1]
 
 
 def save_value(path: Path, value: Any) -> None:
@@ -35,18 +37,29 @@ def load_value(path: Path) -> Any:
         return _value(json.loads(arrays[_TREE].tobytes()), arrays)
 
 
+@functools.cache
 def name_of(function: Callable[..., Any] | type) -> str:
-    """By which `of_name` finds it again."""
-    return f"{function.__module__}:{function.__qualname__}"
+    """Return "room:name", under which `of_name` finds a function or class: short, and the same in whatever file of its
+    room it stands. Raises TypeError for one that it would not find."""
+    room = function.__module__.removeprefix(_OURS).partition(".")[0]
+    name = f"{room}:{function.__qualname__}"
+    if not function.__module__.startswith(_OURS) or of_name(name) is not function:
+        raise TypeError(f"{function} does not travel")
+    return name
 
 
+@functools.cache
 def of_name(name: str) -> Any:
-    """A function or class that this program's pipelines define. Raises InputError for any other."""
-    module, _, attribute = name.partition(":")
-    found = getattr(import_module(module), attribute, None) if module.startswith(_OURS) else None
-    if getattr(found, "__module__", None) != module:  # what a module only imports, deleting folders for one
-        raise InputError(f"a task asks for {name}, which this version does not have: install the same one everywhere")
-    return found
+    """Find a function or class that this program's pipelines define. Raises InputError for any other."""
+    room, _, attribute = name.partition(":")
+    if room.isidentifier() and attribute.isidentifier():
+        root = _PIPELINES / room
+        defined = re.compile(rf"^(class|def) {attribute}\b".encode(), re.MULTILINE)
+        for file in (root.with_suffix(".py"), *sorted(root.rglob("*.py"))):
+            if file.is_file() and defined.search(file.read_bytes()):  # not what a module only imports
+                module = ".".join(file.relative_to(_PIPELINES).with_suffix("").parts)
+                return getattr(import_module(f"{_OURS}{module}"), attribute)
+    raise InputError(f"a task asks for {name}, which this version does not have: install the same one everywhere")
 
 
 @dataclass

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-MOST_STRETCHES = 8
+MAX_STRETCHES = 8
 GOOD, NOTE, BAD = "ok", "note", "BAD"
 
 
@@ -25,16 +25,16 @@ def quoted(path: Path | str) -> str:
     return shlex.quote(str(path))
 
 
-def stretches(ids: Iterable[int], most: int = MOST_STRETCHES) -> str:
-    """[1, 2, 3, 7] -> "1-3, 7"; after `most` of them, how many more there are."""
+def stretches(ids: Iterable[int], limit: int = MAX_STRETCHES) -> str:
+    """[1, 2, 3, 7] -> "1-3, 7"; after `limit` of them, how many more there are."""
     runs: list[list[int]] = []
     for i in sorted(ids):
         if runs and i == runs[-1][-1] + 1:
             runs[-1].append(i)
         else:
             runs.append([i])
-    texts = [f"{r[0]}-{r[-1]}" if len(r) > 1 else str(r[0]) for r in runs[:most]]
-    return ", ".join(texts) + (f" and {len(runs) - most} more stretches" if len(runs) > most else "")
+    texts = [f"{r[0]}-{r[-1]}" if len(r) > 1 else str(r[0]) for r in runs[:limit]]
+    return ", ".join(texts) + (f" and {len(runs) - limit} more stretches" if len(runs) > limit else "")
 
 
 def lost_text(lost: Mapping[str, str]) -> str:

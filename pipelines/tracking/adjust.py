@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 LoadProxy = Callable[[int], ProxyMaps | None]
 OUTLIER_SD = 4.0
-MOST_FRAMES = 400
+MAX_FRAMES = 400
 """Up to so many frames are adjusted together; of more only the keyframes."""
 _FITTED_TOGETHER = 500
 """Keyframes whose fields are fitted at once: by memory alone."""
@@ -70,10 +70,10 @@ def adjust_state(
 ) -> Report:
     """Adjust `state` in place: rounds of scale fields, removal of outliers and bundle adjustment.
 
-    With more than MOST_FRAMES only keyframes and points are adjusted together, and every other
+    With more than MAX_FRAMES only keyframes and points are adjusted together, and every other
     frame follows by itself: the cost grows with the number of keyframes, not of frames.
     """
-    frame_ids = sorted(state.poses) if len(state.poses) <= MOST_FRAMES else list(state.keyframes)
+    frame_ids = sorted(state.poses) if len(state.poses) <= MAX_FRAMES else list(state.keyframes)
     bundle = make_bundle(state, frame_ids)
     ties = sample_depths(bundle, frame_ids, state, intrinsics, load_proxy, metric)
     initial, in_frame = None, bundle.obs_xy

@@ -31,7 +31,7 @@ from .pnp import MIN_INLIERS, solve_pose
 from .relocalise import relocalise
 from .state import FEATURE_SD, Sightings, TrackState
 
-_SAMPLES, _ENOUGH, _LEAST = 24, 4, 2
+_SAMPLES, _ENOUGH, _MIN_RECOGNISED = 24, 4, 2
 """Pictures of a video that are looked at; recognised ones that are enough to stop at, and that are needed."""
 _FOCALS = np.geomspace(0.5, 2.0, 25)
 _SAME_FOCAL, _BETTER = 0.08, 1.25
@@ -128,7 +128,7 @@ def require_overlap(
             if recognised == _ENOUGH:
                 break
         _require_same_focal(run, video, seen, state, seed)
-        if recognised < _LEAST:
+        if recognised < _MIN_RECOGNISED:
             raise InputError(
                 f"{video}: of {len(seen)} of its images {recognised} show what {run.root} has seen, so nothing tells "
                 "where it belongs. Film it from a place that the run has seen on, or make it a run of its own: "

@@ -20,9 +20,9 @@ from .pnp import MIN_INLIERS
 from .relocalise import group_by_points, recognise
 from .state import NO_SIGHTINGS, Sightings, TrackState
 
-_MOST_SCALE_SD = 0.1
+_MAX_SCALE_SD = 0.1
 """Relative: over a stretch about as short as their own errors, given poses do not determine the scale."""
-_LEAST_PATH, _JUMP = 5, 5.0
+_MIN_PATH, _JUMP = 5, 5.0
 """Poses that make a path, and how many times as far as is usual a wrong one lies aside of it."""
 
 Array = NDArray[np.float64]
@@ -201,7 +201,7 @@ def _to_given(state: TrackState, given: GivenPoses, segment: int) -> Similarity 
     ids = [i for i in sorted(state.poses) if state.segment[i] == segment and given.known[i]]
     found = np.array([state.poses[i] for i in ids]).reshape(-1, 4, 4)
     agreed = agreement(found, given.cam_from_world[ids])
-    return None if agreed is None or agreed.scale_sd > _MOST_SCALE_SD else agreed.move
+    return None if agreed is None or agreed.scale_sd > _MAX_SCALE_SD else agreed.move
 
 
 def pose_lost(state: TrackState, given: GivenPoses) -> list[int]:
@@ -228,7 +228,7 @@ def pose_lost(state: TrackState, given: GivenPoses) -> list[int]:
 def stray(given: GivenPoses) -> set[int]:
     """Frames whose given pose is far from the way between those before and behind: no camera jumps there and back."""
     known = np.flatnonzero(given.known)
-    if len(known) < _LEAST_PATH:
+    if len(known) < _MIN_PATH:
         return set()
     centre = se3.inverse(given.cam_from_world[known])[:, :3, 3]
     share = ((known[1:-1] - known[:-2]) / (known[2:] - known[:-2]))[:, None]

@@ -18,7 +18,7 @@ from ...formats.reading import reaching
 from ...formats.splats import read_gaussians
 from ..export.stage import on_earth
 from ..geometry.sparse_model import SparseModel
-from ..outcome import Outcome, evenly, labels_of_channels, load_outcome, map_cloud
+from ..outcome import Outcome, labels_of_channels, load_outcome, map_cloud, spread_sample
 from ..providers import class_colors
 from ..render.gaussian_map import decided_channels
 from ..run.files import BACKBONE, CALIBRATION, CLASSES, FRAMES, MESH
@@ -151,7 +151,7 @@ def _from_run(outcome: Outcome) -> ViewerScene:
     t, k = outcome.trajectory, outcome.calibration.intrinsics
     centers = t.centers[t.is_posed]
     scale = _scale(cloud.means, centers)
-    rows = [outcome.frame_row(i) for i in evenly(t.frame_ids[t.is_keyframe].tolist(), MOST_CAMERAS)]
+    rows = [outcome.frame_row(i) for i in spread_sample(t.frame_ids[t.is_keyframe].tolist(), MOST_CAMERAS)]
     world_from_cam = t.world_from_cam
     channels = decided_channels(m.class_logits).cpu().numpy()
     return ViewerScene(
@@ -214,7 +214,7 @@ def _of_points(
     if not cameras:
         return shown
     frames, k = run.load(FRAMES), run.load(CALIBRATION).intrinsics
-    seen = [ViewerCamera.of(frames[i], pose, k) for i, pose in evenly(cameras, MOST_CAMERAS)]
+    seen = [ViewerCamera.of(frames[i], pose, k) for i, pose in spread_sample(cameras, MOST_CAMERAS)]
     return replace(shown, cameras=seen)
 
 

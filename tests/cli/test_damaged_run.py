@@ -93,7 +93,7 @@ def test_progress_and_errors_as_json_lines(copied_run: Callable[[str], Path]) ->
 
 def test_lost_frames_of_one_cause_are_told_together() -> None:
     assert stretches([7, 1, 2, 3]) == "1-3, 7"
-    assert stretches(range(0, 100, 2), most=3) == "0, 2, 4 and 47 more stretches"
+    assert stretches(range(0, 100, 2), limit=3) == "0, 2, 4 and 47 more stretches"
     lost = {str(i): "blurred" if i == 8 else "too few matches" for i in range(5, 12)}
     assert lost_text(lost) == "7 (too few matches 5-7, 9-11; blurred 8)"
     assert figure_text({}, "lost") == "none"

@@ -19,7 +19,7 @@ from ....formats.atomic import require_room, write_text
 from ....formats.gaussians import GaussianCloud
 from ....formats.sog import morton_order
 from ...geometry.camera import rig_of
-from ...outcome import Outcome, evenly, map_cloud
+from ...outcome import Outcome, map_cloud, spread_sample
 from ...run.folder import RunFolder
 from ...scene.world import Z_UP_FROM_Y_DOWN, World
 from ...types import VOID
@@ -112,7 +112,7 @@ def _cameras(outcome: Outcome, upright: NDArray[np.float64]) -> dict[str, Any]:
                 "r": np.round(t.cam_from_world[row][:3, :3] @ upright.T, 7).ravel().tolist(),
                 "t": round(float(t.timestamps[row]), 3),
             }
-            for row in evenly(rows, MOST_CAMERAS)
+            for row in spread_sample(rows, MOST_CAMERAS)
         ],
         "slope": [k.width / k.fx, k.height / k.fy],
         "shift": [(k.cx - k.width / 2) / k.fx, (k.cy - k.height / 2) / k.fy],

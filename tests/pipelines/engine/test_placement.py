@@ -23,7 +23,6 @@ from msgs_slam.pipelines.engine import placement, tasks
 from msgs_slam.pipelines.engine.placement import ClusterWorkers, Command, LocalPlacement, Placement, RayCluster
 from msgs_slam.pipelines.engine.tasks import Shard, boards_in
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system import values
 from msgs_slam.pipelines.system.progress import Stopped, soft_stop
 
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra msgs-slam[cluster]")
@@ -135,7 +134,8 @@ class Placed:
 
 
 def test_a_cluster_takes_the_tasks_of_a_run_from_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(values, "_OURS", "engine_calls")
+    monkeypatch.setattr(tasks, "name_of", lambda work: work.__name__)
+    monkeypatch.setattr(tasks, "of_name", lambda name: getattr(engine_calls, name))
     monkeypatch.setattr(tasks, "TASK_MODULES", ("engine_calls",))
     (folder := tmp_path / "proxy.partial").mkdir()
     workers = ClusterWorkers(Placed(tmp_path), 4, 1, 2, ("-v",))  # type: ignore[arg-type]

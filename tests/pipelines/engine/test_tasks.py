@@ -24,8 +24,8 @@ from msgs_slam.pipelines.engine.runner import run_stages
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.engine.tasks import Shard, SharedWorkers, TaskBoard, boards_in, in_chunks
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system import values
 from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.system.values import load_value
 
 HOLDS = "import fcntl, sys; f = open(sys.argv[1], 'ab'); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); input()"
 
@@ -33,7 +33,8 @@ HOLDS = "import fcntl, sys; f = open(sys.argv[1], 'ab'); fcntl.flock(f, fcntl.LO
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Of an unfinished stage; the tasks are those of the tests."""
-    monkeypatch.setattr(values, "_OURS", "engine_calls")
+    monkeypatch.setattr(tasks, "name_of", lambda work: work.__name__)
+    monkeypatch.setattr(tasks, "of_name", lambda name: getattr(engine_calls, name))
     monkeypatch.setattr(tasks, "TASK_MODULES", ("engine_calls",))
     (tmp_path / "proxy.partial").mkdir()
     return tmp_path / "proxy.partial"
@@ -107,7 +108,7 @@ def test_what_a_killed_process_was_at_is_done_by_another(folder: Path) -> None:
     process.kill()
     process.wait()
     assert board.do_one(Shard(), engine_calls.silent)
-    assert values.load_value(board.done(0)) == 2
+    assert load_value(board.done(0)) == 2
 
 
 def test_a_new_lead_waits_for_who_is_at_a_task_and_begins_anew(folder: Path) -> None:
@@ -167,7 +168,7 @@ def test_two_that_end_the_same_task_without_locks_do_not_disturb_each_other(
 
     monkeypatch.setattr(atomic.os, "replace", interrupted)
     assert board.do_one(Shard(), engine_calls.silent)
-    assert values.load_value(board.done(0)) == 4
+    assert load_value(board.done(0)) == 4
     assert others
 
 
@@ -188,7 +189,6 @@ def test_tasks_of_a_run_given_by_a_relative_path_can_be_done_from_elsewhere(
     def run(context: StageContext) -> dict[str, Any]:
         return {"sum": sum(in_chunks(context, engine_calls.known_in_chunk, 6, number=7))}
 
-    monkeypatch.setattr(values, "_OURS", "")
     (root := folder.parent / "here").mkdir()
     (away := folder.parent / "elsewhere").mkdir()
     monkeypatch.chdir(root)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.sfm.bridges import LEAST, Picture, bridged, weakly_connected
+from msgs_slam.pipelines.sfm.bridges import MIN_SHARED, Picture, bridged, weakly_connected
 from msgs_slam.pipelines.sfm.matching import VerifiedPair, match_features
 from msgs_slam.pipelines.sfm.retrieval import describe, learn_vocabulary
 from msgs_slam.pipelines.types import Features
@@ -55,7 +55,7 @@ def _bridged(
 
 
 def test_a_keyframe_is_weak_where_few_features_match_before_and_behind_it() -> None:
-    many, few = np.arange(2 * LEAST), np.arange(10)
+    many, few = np.arange(2 * MIN_SHARED), np.arange(10)
     pairs = [_pair(k, k + 1, many, many if k != 3 else many[::-1] + 5000) for k in range(6)]
     assert weakly_connected(pairs, 7, reach=8) == [4]
     skipping = [*pairs, _pair(2, 4, many, many)]  # from further off they match

@@ -14,7 +14,7 @@ from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.sfm.bundle import Bundle, adjust_bundle
 from msgs_slam.pipelines.sfm.lens import unknown_camera
-from msgs_slam.pipelines.sfm.rolling import LEAST_GAIN, Shutter, adjust_rolling, estimate, read_readout, velocities
+from msgs_slam.pipelines.sfm.rolling import MIN_GAIN, Shutter, adjust_rolling, estimate, read_readout, velocities
 from msgs_slam.pipelines.tracking.adjust import adjust_state
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
@@ -109,7 +109,7 @@ def test_readout_is_found_in_closed_form_and_only_where_there_is_one() -> None:
     for axis in ((1.0, 0.0), (0.0, 1.0)):
         seconds, share = estimate(settled, settled.obs_xy, CAMERA, TIMES, axis)
         assert abs(seconds) < 0.001
-        assert seconds**2 * share < LEAST_GAIN / 10
+        assert seconds**2 * share < MIN_GAIN / 10
     rolling = adjust_bundle(seen_by(READOUT)[0], CAMERA).bundle
     seconds, share = estimate(rolling, rolling.obs_xy, CAMERA, TIMES, (0.0, 1.0))
     assert 0.6 * READOUT < seconds < 1.1 * READOUT

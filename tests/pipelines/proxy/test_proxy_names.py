@@ -191,7 +191,7 @@ def test_voxels_grow_where_a_scene_has_too_many() -> None:
             rows.append((keys, np.stack([np.bincount(place, v) for v in values.T], axis=1)))
         return rows
 
-    grown = merge(0.05, gathered(0.05), most=2000)
+    grown = merge(0.05, gathered(0.05), limit=2000)
     plain = merge(0.1, gathered(0.1))
     assert grown.size == pytest.approx(0.1)
     assert len(grown) == pytest.approx(len(plain), rel=0.05)

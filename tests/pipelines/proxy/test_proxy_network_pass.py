@@ -143,7 +143,7 @@ def test_without_a_head_alike_features_are_a_class(room: Room, tmp_path: Path) -
     folder = tmp_path / "scratch"
     folder.mkdir()
     provider: Any = OnnxClusters(
-        read_card(transformer(tmp_path)), workplace(sequence, tmp_path, folder, megabytes=0), most=3
+        read_card(transformer(tmp_path)), workplace(sequence, tmp_path, folder, megabytes=0), limit=3
     )
 
     def depth_of(frame: Frame) -> DepthEstimate:

@@ -24,7 +24,7 @@ from msgs_slam.pipelines.evaluation.labels import count_labels, score
 from msgs_slam.pipelines.networks.card import read_card
 from msgs_slam.pipelines.networks.labels import network_probabilities
 from msgs_slam.pipelines.networks.session import Network
-from msgs_slam.pipelines.networks.words import MOST_WORDS, with_words
+from msgs_slam.pipelines.networks.words import MAX_WORDS, with_words
 from msgs_slam.pipelines.proxy.inputs import check_proxy, proxy_inputs
 from msgs_slam.pipelines.proxy.stage import run
 from msgs_slam.pipelines.read_config import load_config
@@ -214,7 +214,7 @@ def refused(card: Path, source: Path, words: str, said: str) -> None:
         ("", "finds what it is asked for: --classes"),
         (" , ,", "finds what it is asked for: --classes"),
         ("wall, floor, Wall", "'Wall' is there twice"),
-        (", ".join(f"thing {i}" for i in range(MOST_WORDS + 1)), "201 words, at most 200"),
+        (", ".join(f"thing {i}" for i in range(MAX_WORDS + 1)), "201 words, at most 200"),
     ],
 )
 def test_words_that_cannot_be_classes_are_refused(source: Path, card: Path, words: str, said: str) -> None:

@@ -12,7 +12,7 @@ from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.mapping.measure import ViewFigures
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system.values import load_value, of_name, save_value
+from msgs_slam.pipelines.system.values import load_value, name_of, of_name, save_value
 from msgs_slam.pipelines.types import Intrinsics
 
 
@@ -26,6 +26,13 @@ def test_what_tasks_are_made_of_comes_back(tmp_path: Path) -> None:
     assert [type(f) for f in found] == [type(s) for s in sent]
     np.testing.assert_array_equal(found[9][4], sent[9][4])  # type: ignore[index]
     assert (*found[:9], *found[10:]) == (*sent[:9], *sent[10:])
+
+
+def test_names_on_disk_are_short_and_of_no_file() -> None:
+    assert [name_of(c) for c in (Intrinsics, Config, RunFolder, DepthFields)] == [
+        "types:Intrinsics", "config:Config", "run:RunFolder", "depth:DepthFields",
+    ]  # fmt: skip
+    assert all(of_name(name_of(c)) is c for c in (Intrinsics, Config, RunFolder, DepthFields))
 
 
 def test_scale_fields_come_back(tmp_path: Path) -> None:
@@ -44,18 +51,14 @@ class Foreign:
 
 
 def test_what_is_not_of_this_program_is_refused(tmp_path: Path) -> None:
-    save_value(tmp_path / "foreign.npz", Foreign("x"))
-    with pytest.raises(InputError, match="install the same one everywhere"):
-        load_value(tmp_path / "foreign.npz")
-    with pytest.raises(InputError, match="install the same one everywhere"):
-        of_name("os:system")
-    with pytest.raises(InputError, match="install the same one everywhere"):
-        of_name("msgs_slam.pipelines.engine.tasks:shutil")
-    with pytest.raises(InputError, match="install the same one everywhere"):
-        of_name("msgs_slam.pipelines.system.values:save_arrays")
-    with pytest.raises(TypeError, match="does not travel"):
-        save_value(tmp_path / "thing.npz", object())
-    tree = np.frombuffer(b'{"msgs_slam.pipelines.system.values:save_value": {"path": "x", "value": 1}}', np.uint8)
+    for name in ("os:system", "engine:shutil", "system:save_arrays", "system:of_name.cache_clear", "..:Config",
+                 "msgs_slam.pipelines.types:Frame"):  # fmt: skip
+        with pytest.raises(InputError, match="install the same one everywhere"):
+            of_name(name)
+    for value in (object(), Foreign("x"), dataclass(type("Frame", (), {"__module__": Intrinsics.__module__}))()):
+        with pytest.raises(TypeError, match="does not travel"):
+            save_value(tmp_path / "thing.npz", value)
+    tree = np.frombuffer(b'{"system:save_value": {"path": "x", "value": 1}}', np.uint8)
     save_arrays(tmp_path / "call.npz", {"tree": tree})
     with pytest.raises(
         InputError, match=r"call\.npz is damaged or no value of this program .*no dataclass.*: delete it"

@@ -126,7 +126,7 @@ def test_frames_outside_the_adjustment_follow_it(
     open_stage: Callable[..., StageContext],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(adjust, "MOST_FRAMES", 12)
+    monkeypatch.setattr(adjust, "MAX_FRAMES", 12)
     made = make_run(tmp_path / "run", backbone_scale=0.4)
     figures = finish(open_stage(made.run, "tracking"))
     assert figures["adjusted_frames"] == 9
