@@ -143,7 +143,7 @@ def test_model_taken_at_once_stays_as_it_is() -> None:
 @pytest.mark.parametrize("together", [True, False])
 def test_tracked_frames_are_adjusted_with_the_readout(together: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not together:
-        monkeypatch.setattr("msgs_slam.pipelines.tracking.adjust.MOST_FRAMES", 10)
+        monkeypatch.setattr("msgs_slam.pipelines.tracking.adjust.MAX_FRAMES", 10)
     bundle, points = seen_by(READOUT)
     errors = []
     for shutter in (Shutter(), Shutter((0.0, READOUT), TIMES)):

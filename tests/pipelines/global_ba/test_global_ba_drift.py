@@ -106,7 +106,7 @@ def close(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Callable[[str], tuple[RunFolder, dict]]:
     """close(joint): a run whose loop is closed, and the stage's figures."""
-    monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.LEAST_ALIKE", -1.0)
+    monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.MIN_ALIKE", -1.0)
     monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.GAP", 2)
 
     def run(joint: str) -> tuple[RunFolder, dict]:

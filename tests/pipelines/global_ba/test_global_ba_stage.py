@@ -146,7 +146,7 @@ def error(poses: Array, truth: Array) -> float:
 def test_a_loop_is_closed_and_the_map_goes_along(
     mapped: Callable[[str], MadeRun], open_stage: Callable[..., StageContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.LEAST_ALIKE", -1.0)
+    monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.MIN_ALIKE", -1.0)
     made = mapped("run")
     before = error(made.run.load(TRAJECTORY, "mapping").cam_from_world, made.cam_from_world)
     config = load_config(overrides=["global_ba.joint=never"])

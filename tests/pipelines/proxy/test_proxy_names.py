@@ -46,7 +46,7 @@ def depth_of(room: Room, frame: Frame) -> DepthEstimate:
 
 
 def gather(room: Room, said: dict[int, NDArray[np.float32]], vocabulary: Vocabulary) -> NamedScene:
-    segments = SegmentLabels(room.sequence(), vocabulary.most, SilentProgress())
+    segments = SegmentLabels(room.sequence(), vocabulary.limit, SilentProgress())
     return NamedScene.gather(segments, room.frames, lambda f: depth_of(room, f), lambda f: said[f.id], vocabulary)
 
 

@@ -114,7 +114,7 @@ def test_frames_follow_their_keyframes_but_for_the_errors_of_its_features(
     known_bundle: KnownBundle, monkeypatch: pytest.MonkeyPatch, together: bool, share: float
 ) -> None:
     if not together:
-        monkeypatch.setattr("msgs_slam.pipelines.tracking.adjust.MOST_FRAMES", 4)
+        monkeypatch.setattr("msgs_slam.pipelines.tracking.adjust.MAX_FRAMES", 4)
     truth, points = known_bundle.cam_from_world, known_bundle.points
     errors = []
     for is_known in (True, False):
@@ -190,7 +190,7 @@ def test_same_input_same_bytes_and_any_order(known_bundle: KnownBundle) -> None:
 
 
 def test_reaches_the_minimum_of_ceres(known_bundle: KnownBundle, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("msgs_slam.pipelines.sfm.bundle._LEAST_GAIN", 1e-12)
+    monkeypatch.setattr("msgs_slam.pipelines.sfm.bundle._MIN_GAIN", 1e-12)
     bundle, intrinsics = without_depth(known_bundle.bundle), known_bundle.intrinsics
     ours = adjust_bundle(bundle, intrinsics, 100, width=1e6)
     reconstruction = to_colmap(bundle, intrinsics)
