@@ -90,6 +90,10 @@ class RunConfig:
             "MSGS-SLAM as printed, from each frame's own --depth and --semantics. Default: default.",
         ),
     )  # fmt: skip
+    kappa: float = setting(
+        0.0, "κ of the paper's (7), with run.method=paper: how much less an occluder hides that disagrees with the "
+        "proxy depth, the scene's depth being 1; slow. 0 = as usual", within=(0, 10_000),
+    )  # fmt: skip
     device: str = setting(
         "auto", "where dense work runs; auto takes a GPU if there is one", ("auto", "cpu", "cuda"),
         option=Option("device", help="Where dense work runs. Default: auto."),
@@ -370,12 +374,20 @@ class Config:
     export: ExportConfig = field(default_factory=ExportConfig)
 
 
+PAPERS_PROXY: dict[str, Any] = {"frames": "all", "fuse": "never", "moving": "keep"}
+
+
 def with_method(config: Config) -> Config:
     """Return the settings as `run.method` needs them: the paper gives every frame its own proxies, unmixed with what
     structure from motion knows."""
-    if config.run.method != "paper":
-        return config
-    return replace(config, proxy=replace(config.proxy, frames="all", fuse="never", moving="keep"))
+    return replace(config, proxy=replace(config.proxy, **PAPERS_PROXY)) if config.run.method == "paper" else config
+
+
+def overridden(config: Config) -> list[str]:
+    """Settings that were chosen and that `with_method` gives another value, as name=value."""
+    chosen = {k: getattr(config.proxy, k) for k in PAPERS_PROXY if config.run.method == "paper"}
+    usual = ProxyConfig()
+    return [f"proxy.{k}={v}" for k, v in chosen.items() if v not in (getattr(usual, k), PAPERS_PROXY[k])]
 
 
 def allowed_values(known: Field[Any]) -> str:

@@ -9,7 +9,7 @@ from ..formats.atomic import own_temporaries, temporary_of, write_text
 from ..formats.errors import InputError, RecoverableError
 from ..formats.reading import require_listable, require_unicode
 from ..formats.video import probe_video
-from .config import SOURCE_LIST, STAGES, Config, with_method
+from .config import SOURCE_LIST, STAGES, Config, overridden, with_method
 from .engine.runner import run_stages
 from .engine.stages import Stage, TaskWorkers
 from .engine.tasks import BETWEEN_LOOKS, Shard, SharedWorkers, boards_in, set_threads
@@ -101,13 +101,23 @@ def reconstruct(
     """
     require_unicode(source.resolve())  # the manifest names it
     require_unicode(run.root.absolute())
-    config = with_method(with_absolute_paths(config))
+    config = _settled(config)
     digest = source_digest(source, config.run.format)
     _require_run_or_empty(run)
     resolve_device(config.run.device)  # refused before anything is written
     with locked(run):
         _require_same_source(run, source, digest)
         return _run(run, source.resolve(), digest, config, progress, until, workers, threads)
+
+
+def _settled(config: Config) -> Config:
+    """The settings as the method needs them; a chosen one that it does not use is warned of."""
+    if lost := overridden(config):
+        log.warning(
+            f"--method paper gives every frame its own proxies as they are: {', '.join(lost)} is not used. Leave it "
+            "out, or use --method default"
+        )
+    return with_method(with_absolute_paths(config))
 
 
 def resume(
@@ -127,7 +137,7 @@ def resume(
         )
     origin = load_source(run)
     source = Path(origin.path)
-    config = with_method(with_absolute_paths(config or load_settings(run)))
+    config = _settled(config or load_settings(run))
     resolve_device(config.run.device)
     with locked(run):
         once_locked()

@@ -21,7 +21,8 @@ class Constants:
 
     # (7): weight of an occluder
     kappa: float = 0.0
-    """κ, in units of the scene's depth; printed without a value. 0 is ordinary blending, which compiled kernels do."""
+    """κ, in units of the scene's depth, for the map: `run.kappa`; printed without a value. 0, ordinary blending, is
+    compiled."""
 
     # (10) to (14): keyframes
     eta: float = 0.08

@@ -17,9 +17,12 @@ from ..render.api import Rendering
 from ..types import VOID
 from .constants import PAPER, Constants
 from .gaussians import Gaussians, semantic_image, show
+from .uncertainty import MirrorPlane, mirror_plane, symmetry_pull
 
 RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2, "class_logits": 5e-2}
 """Of Adam; positions in radii of the Gaussian."""
+MIRROR = 0.005
+"""Of the scene's depth: how near a mirror image has to be."""
 _PALETTE_SEED = 7
 
 
@@ -141,6 +144,18 @@ def prune(gaussians: Gaussians, unit: float) -> None:
     bad = useless(gaussians.map, 0.03, 0.15 * unit)
     if bool(bad.any()):
         gaussians.keep(~bad)
+
+
+@torch.no_grad()
+def draw_together(gaussians: Gaussians, unit: float, seed: int) -> MirrorPlane:
+    """Section 3.1 for the map: Gaussians and mirror images of their class are drawn together, where there are any."""
+    means = gaussians.table.values["means"].detach()
+    logits = gaussians.table.values["class_logits"].detach()
+    classes = logits.argmax(1).numpy() if logits.shape[1] else np.zeros(len(gaussians), np.int64)
+    points = means.double().numpy()
+    plane = mirror_plane(points, classes, MIRROR * unit, seed)
+    means.copy_(torch.from_numpy(symmetry_pull(points, classes, plane, MIRROR * unit)))
+    return plane
 
 
 def clip_beside_boundary(image: Tensor, channels: Tensor, limit: float) -> None:

@@ -1,4 +1,4 @@
-"""Figure 1 of the paper: for each frame predict, track, select, grow, optimise; loops and adjustment: `stages`."""
+"""Figure 1 of the paper: for each frame predict, track, adjust, grow, select, optimise; the rest is in `stages`."""
 
 from __future__ import annotations
 
@@ -14,8 +14,11 @@ from torch import Tensor
 from ..depth.fields import FINE, field_scales
 from ..geometry import se3
 from ..geometry.camera import unproject_depth
+from ..mapping.move_map import follow_keyframes
 from ..mapping.views import View
 from ..render.api import Rendering
+from ..types import Intrinsics
+from .adjustment import carry, local_adjustment
 from .constants import PAPER, Constants
 from .gaussians import Gaussians, scaled_depth, show
 from .keyframes import overlap, select, semantic_keyframes, time_weights
@@ -26,6 +29,8 @@ from .uncertainty import agreement, semantic_agreement, with_agreement
 STEPS, FIRST_STEPS = 15, 60
 """Of mapping, after each keyframe and after the first."""
 PRUNE_EVERY = 10
+WINDOW = 8
+"""Keyframes that are adjusted together with each new one."""
 _GRID = (40, 30)
 _STRIDE = 8
 _COVERED = 0.1
@@ -71,6 +76,8 @@ class Slam:
         view = self._agreeing(view, shown, constants)
         self.fields[view.frame_id] = fitted_field(view, shown.depth.numpy(), shown.silhouette.numpy() > constants.t_sil)
         self.looks[view.frame_id] = _looks(view)
+        self._adjust(view_of, view.intrinsics, constants)
+        pose = self.poses[view.frame_id]
         grow(self.gaussians, self._scaled(view), pose, self.classes, constants)
         chosen = self._select(view, pose, constants)
         self._optimise(view_of, STEPS, chosen, constants)
@@ -125,6 +132,23 @@ class Slam:
         weights = time_weights(ages, np.array([self.looks[k][1] for k in others]), constants)
         rng = np.random.default_rng([self.seed, view.frame_id])
         return [view.frame_id, *(others[i] for i in select(overlaps, differs, weights, rng, constants))]
+
+    def _adjust(self, view_of: Callable[[int], View], camera: Intrinsics, constants: Constants) -> None:
+        """(25) over the last keyframes; the Gaussians and the frames between move with them."""
+        assert self.gaussians is not None
+        ids = self.keyframes[-WINDOW:]
+        poses, fields = np.stack([self.poses[i].numpy() for i in ids]), np.stack([self.fields[i] for i in ids])
+        moves = np.arange(len(ids)) > 0
+        bends = moves | (ids[0] == self.keyframes[0])  # the scale of a later one is that of the map before
+        new, bent = local_adjustment(view_of, ids, poses, fields, moves, bends, self.classes, self.unit, constants)
+        carry(self.gaussians, ids, poses, new, bent - fields, camera)
+        frames = np.array([i for i in self.poses if i > ids[0] and i not in self.fields])
+        if len(frames):
+            was = np.stack([self.poses[i].numpy() for i in frames.tolist()])
+            followed = follow_keyframes(frames, was, np.array(ids), poses, new, np.ones(len(ids)))
+            self.poses.update(zip(frames.tolist(), torch.from_numpy(followed), strict=True))
+        self.poses.update(zip(ids, torch.from_numpy(new), strict=True))
+        self.fields.update(zip(ids, bent, strict=True))
 
     def _optimise(self, view_of: Callable[[int], View], steps: int, chosen: list[int], constants: Constants) -> None:
         """Steps on (18), every other by the frame itself, the first of the chosen."""

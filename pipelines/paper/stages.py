@@ -5,7 +5,8 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ...formats.tensors import load_tensors, save_tensors
-from ..compute.adam import AdamTable
+from ..config import Config
 from ..depth.fields import DepthFields
 from ..engine.stages import Stage, StageContext
 from ..geometry.se3 import Similarity
@@ -37,17 +38,17 @@ from ..run.files import (
 from ..system.progress import is_asked
 from ..system.wording import stretches
 from ..types import LoopEdge, Trajectory
-from .adjustment import Adjustment, adjust, pose_graph
+from .adjustment import carry, global_adjustment, local_adjustment, pose_graph
 from .gaussians import Gaussians
 from .loops import candidates, close, small_looks
-from .mapping import optimise
+from .mapping import draw_together, optimise
 from .recording import Recording, constants_of, sparse_model, trajectory_of
 from .slam import Slam
 
 SNAPSHOT_EVERY = 5
 """Frames between two snapshots."""
-MAP_PASSES, JOINT_PASSES, FINE_PASSES = 1, 6, 4
-"""Visits of each keyframe: in `mapping`; of poses, depths and map together; and of the map alone at full size."""
+MAP_PASSES, FINE_PASSES = 1, 4
+"""Visits of each keyframe: in `mapping`, and at full size once poses and depths are adjusted."""
 
 
 def track(context: StageContext) -> dict[str, Any]:
@@ -106,13 +107,15 @@ def map_keyframes(context: StageContext) -> dict[str, Any]:
     recording, run = Recording(context), context.run
     trajectory, fields = run.load(TRAJECTORY, "tracking"), run.load(DEPTH_FIELDS, "tracking")
     gaussians = Gaussians.of(run.load(MAP, "tracking"))
+    ids = trajectory.frame_ids[trajectory.is_keyframe].tolist()
+    mirror = draw_together(gaussians, scene_depth(recording, ids, fields), context.config.run.seed)
     _visit(context, recording, gaussians, trajectory, fields, MAP_PASSES, "mapping")
     MAP.save(context.folder, gaussians.map)
     TRAJECTORY.save(context.folder, trajectory)
     _save_exposure(context, trajectory)
     figures = {
-        "keyframes": int(trajectory.is_keyframe.sum()), "gaussians": len(gaussians), "submaps": 1,
-        "iterations": MAP_PASSES * int(trajectory.is_keyframe.sum()), "classes": len(recording.class_ids),
+        "keyframes": len(ids), "gaussians": len(gaussians), "submaps": 1,
+        "iterations": MAP_PASSES * len(ids), "classes": len(recording.class_ids), "symmetry": mirror.confidence,
         **_measure(recording, gaussians.map, trajectory, fields),
     }  # fmt: skip
     FIGURES["mapping"].save(context.folder, {**figures, "class_ids": list(recording.class_ids), "submaps": []})
@@ -165,7 +168,7 @@ def _save_exposure(context: StageContext, trajectory: Trajectory) -> None:
 
 
 def close_and_adjust(context: StageContext) -> dict[str, Any]:
-    """Loops (21) to (24), then poses, depths and map together (26), then the map at full size."""
+    """Loops (21) to (24), then poses and depths together (26), then the map at full size."""
     recording, run = Recording(context), context.run
     trajectory, fields = run.load(TRAJECTORY, "mapping"), run.load(DEPTH_FIELDS, "tracking")
     gaussian_map = run.load(MAP, "mapping")
@@ -236,45 +239,68 @@ def _following(trajectory: Trajectory, new: NDArray[np.float64]) -> Trajectory:
 def _adjusted(
     context: StageContext, recording: Recording, trajectory: Trajectory, fields: DepthFields, gaussian_map: GaussianMap
 ) -> tuple[Gaussians, Trajectory, DepthFields]:
-    """(26) at the working size, the world brought back to the proxies' scale, then (18) at full size; goes on from the
-    last pass."""
-    snapshot, seed, classes = context.snapshot / "joint.safetensors", context.config.run.seed, len(recording.class_ids)
+    """(26), the world brought back to the proxies' scale, then (18) at full size; goes on from the last pass."""
+    snapshot = context.snapshot / "adjusted.safetensors"
     ids = trajectory.frame_ids[trajectory.is_keyframe].tolist()
-    poses = torch.from_numpy(trajectory.cam_from_world[trajectory.is_keyframe])
-    gaussians = Gaussians.of(gaussian_map)
-    joint = Adjustment.of(gaussians, ids, poses, recording.camera, scene_depth(recording, ids, fields))
-    done = 0
     if snapshot.exists():
         held = load_tensors(snapshot)
-        done, joint.table = int(held["done"]), AdamTable.from_tensors(held, "joint", ("twist", "field"))
-        joint.gaussians = gaussians = Gaussians.from_tensors(held)
+        done, gaussians = int(held["done"]), Gaussians.from_tensors(held)
+        poses, bent = held["poses"].numpy(), held["fields"].numpy()
+    else:
+        done, gaussians = 0, Gaussians.of(gaussian_map)
+        old, own = trajectory.cam_from_world[trajectory.is_keyframe], np.stack([fields.of_frame[i] for i in ids])
+        unit, classes = scene_depth(recording, ids, fields), len(recording.class_ids)
+        constants = constants_of(context.config)
+        poses, bent = global_adjustment(recording.views.__getitem__, ids, old, own, classes, unit, constants)
+        carry(gaussians, ids, old, poses, bent - own, recording.camera)
+        gaussians.resize(-float(bent.mean()))  # the proxies' scale is right on the whole
+    kept = {"poses": torch.from_numpy(poses), "fields": torch.from_numpy(bent)}
 
     def save(passes: int) -> None:
-        state = {**gaussians.to_tensors(), **joint.table.to_tensors("joint"), "done": torch.tensor(passes)}
-        save_tensors(snapshot, state)
+        save_tensors(snapshot, {**gaussians.to_tensors(), **kept, "done": torch.tensor(passes)})
 
-    adjust(
-        joint, lambda n: recording.scaled(ids[n], fields), len(ids), classes, JOINT_PASSES, seed, done, save,
-        lambda order: context.progress.track(order, "adjusting", len(order)), constants_of(context.config),
-    )  # fmt: skip
-    own = np.stack([fields.of_frame[i] for i in ids]) + joint.field.numpy()
-    shrunk = -float(own.mean())  # the proxies' scale is right on the whole
-    trajectory = _following(trajectory, joint.moved(joint.table.values["twist"].detach()).numpy())
+    if done == 0:
+        save(0)
+    trajectory, shrunk = _following(trajectory, poses), -float(bent.mean())
+    trajectory = _between(context, recording, trajectory, DepthFields(dict(zip(ids, bent, strict=True))))
     resized = Similarity(math.exp(shrunk), np.eye(3), np.zeros(3)).apply_to_poses(trajectory.cam_from_world)
     resized[~trajectory.is_posed] = np.eye(4)
-    trajectory, fields = (
-        replace(trajectory, cam_from_world=resized),
-        DepthFields(dict(zip(ids, own + shrunk, strict=True))),
-    )
-    if done <= JOINT_PASSES:
-        joint.settle()
-        gaussians.resize(shrunk)
+    trajectory = replace(trajectory, cam_from_world=resized)
+    fields = DepthFields(dict(zip(ids, bent + shrunk, strict=True)))
     fine = Recording(context, context.config.mapping.max_side)
-    begin = max(done - JOINT_PASSES, 0)
-    _visit(
-        context, fine, gaussians, trajectory, fields, FINE_PASSES, "mapping", begin, lambda n: save(JOINT_PASSES + n)
-    )
+    _visit(context, fine, gaussians, trajectory, fields, FINE_PASSES, "mapping", done, save)
     return gaussians, trajectory, fields
 
 
-STAGES = [Stage("tracking", track), Stage("mapping", map_keyframes), Stage("global_ba", close_and_adjust)]
+def _between(context: StageContext, recording: Recording, trajectory: Trajectory, fields: DepthFields) -> Trajectory:
+    """(25) for each frame that is no keyframe and its two neighbours that are, of which only the frame moves."""
+    keys, poses = trajectory.frame_ids[trajectory.is_keyframe], trajectory.cam_from_world.copy()
+    unit, row = (
+        scene_depth(recording, keys.tolist(), fields),
+        {i: n for n, i in enumerate(trajectory.frame_ids.tolist())},
+    )
+    left = trajectory.frame_ids[trajectory.is_posed & ~trajectory.is_keyframe].tolist()
+    for i in context.progress.track(left, "adjusting", len(left)):
+        after = int(np.clip(np.searchsorted(keys, i), 1, len(keys) - 1))
+        ids = [*keys[max(after - 1, 0) : after + 1].tolist(), i]
+        own = np.stack([fields.of_frame[k] for k in [*ids[:-1], ids[0]]])
+        where = np.stack([poses[row[k]] for k in ids])
+        moves = np.arange(len(ids)) == len(ids) - 1
+        found, _ = local_adjustment(
+            recording.views.__getitem__, ids, where, own, moves, moves, len(recording.class_ids), unit,
+            constants_of(context.config),
+        )  # fmt: skip
+        poses[row[i]] = found[-1]
+    return replace(trajectory, cam_from_world=poses)
+
+
+def _inputs(source: Path, config: Config) -> dict[str, float]:
+    """Constants come from settings of other stages too."""
+    return asdict(constants_of(config))
+
+
+STAGES = [
+    Stage("tracking", track, _inputs),
+    Stage("mapping", map_keyframes, _inputs),
+    Stage("global_ba", close_and_adjust, _inputs),
+]

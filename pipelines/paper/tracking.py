@@ -21,7 +21,8 @@ _RATES = ((0.06, 0.004), (0.1, 0.01), (0.15, 0.03))
 distance. The paper's 3e-3, of a twist, is the same for all six numbers."""
 _DIFFERENCE, _FLOOR = 2e-3, 0.02
 """Of twists for differences, in radians and scene depths; and the smallest residual that is divided by."""
-_ROUNDS = 4
+_ROUNDS = (1, 2, 4)
+"""Of the paper's number of steps on each size, the whole first; (25) goes on from there."""
 _PATIENCE = 6
 """Steps without a lower loss after which a size is done."""
 
@@ -68,7 +69,7 @@ def track(
     problems = [_Problem(gaussians, v, starts, classes, unit, level, seed, constants) for level, v in enumerate(views)]
     pose = min(starts, key=lambda start: problems[-1].loss(start))
     for level in reversed(range(len(views))):
-        pose, loss = _converge(problems[level], pose, constants.track_iterations, _RATES[level])
+        pose, loss = _converge(problems[level], pose, constants.track_iterations, level)
     with torch.no_grad():
         shown = problems[0].show(pose, None)
     return Tracked(pose, loss, float((shown.silhouette > constants.t_sil).float().mean()))
@@ -125,12 +126,12 @@ class _Problem:
         return float(self.of(pose, None))
 
 
-def _converge(problem: _Problem, pose: Tensor, steps: int, rates: tuple[float, float]) -> tuple[Tensor, float]:
+def _converge(problem: _Problem, pose: Tensor, steps: int, level: int) -> tuple[Tensor, float]:
     """Rounds of the paper's number of steps, as long as one lowers the loss by a fiftieth."""
     loss = math.inf
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS[level]):
         before = loss
-        pose, loss = _descend(problem, pose, steps, rates)
+        pose, loss = _descend(problem, pose, steps, _RATES[level])
         if loss > 0.98 * before:
             break
     return pose, loss

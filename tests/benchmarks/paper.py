@@ -105,7 +105,7 @@ def values(figures: dict[str, Any]) -> list[float | None]:
         found: Any = figures
         for key in path:
             found = found.get(key) if isinstance(found, dict) else None
-        out.append(None if found is None else factor * float(found))
+        out.append(factor * float(found) if isinstance(found, (int, float)) else None)
     return out
 
 

@@ -7,14 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 from finished import note_finished
 
+from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.config import Config, ProxyConfig, RunConfig, with_method
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.paper import stages
+from msgs_slam.pipelines.paper.constants import PAPER
+from msgs_slam.pipelines.paper.recording import constants_of
 from msgs_slam.pipelines.paper.stages import STAGES
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.run.files import CLASS_IDS, DEPTH_FIELDS, MAP, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -97,7 +102,7 @@ def test_poses_and_map_come_from_rendering_alone(whole: RunFolder, world_sequenc
     assert len(whole.load(SPARSE, "global_ba").points_in_world) > 100
 
 
-@pytest.mark.parametrize(("number", "label", "after"), [(0, "tracking", 6), (2, "adjusting", 9), (2, "mapping", 9)])
+@pytest.mark.parametrize(("number", "label", "after"), [(0, "tracking", 6), (2, "mapping", 3), (2, "mapping", 9)])
 def test_stopped_and_gone_on_with_it_ends_with_the_same_bytes(
     whole: RunFolder, world_sequence: Path, tmp_path: Path, number: int, label: str, after: int
 ) -> None:
@@ -149,3 +154,26 @@ def test_the_switch_changes_three_stages_and_what_proxies_are() -> None:
     assert with_method(Config()) == Config()
     assert with_method(CONFIG).proxy == ProxyConfig(frames="all", fuse="never", moving="keep")
     assert with_method(with_method(CONFIG)) == with_method(CONFIG)
+
+
+def test_kappa_is_a_setting_and_what_depends_on_it_is_made_again() -> None:
+    given = load_config(overrides=["run.method=paper", "run.kappa=5"])
+    assert constants_of(given).kappa == 5
+    assert constants_of(CONFIG) == PAPER
+    for stage in all_stages("paper")[2:5]:
+        assert stage.inputs is not None
+        assert stage.inputs(Path(), given) != stage.inputs(Path(), CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("given", "lost"),
+    [(("proxy.fuse=always", "proxy.moving=keep"), ["proxy.fuse=always"]), (("proxy.frames=all",), []), ((), [])],
+)
+def test_a_chosen_setting_that_the_paper_overrides_is_warned_of(
+    given: tuple[str, ...], lost: list[str], tmp_path: Path, world_sequence: Path
+) -> None:
+    words = [str(world_sequence), "--out", str(tmp_path / "run.msgs"), "--until", "frames", "--method", "paper"]
+    done = CliRunner().invoke(main, ["reconstruct", *words, *(w for name in given for w in ("--set", name))])
+    assert done.exit_code == 0, done.output
+    assert [f"{name} is not used" in done.output for name in lost] == [True] * len(lost)
+    assert ("is not used" in done.output) == bool(lost)
