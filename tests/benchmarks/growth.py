@@ -2,7 +2,7 @@
 
     python tests/benchmarks/growth.py [COUNT ...] [--only NAME ...]          counts of keyframes, default 155 600 2400
 
-The keyframes walk through the building of `tests/world/building.py`, whose surfaces are planes here: depth, points and
+The keyframes walk through the building of `worlds/building.py`, whose surfaces are planes here: depth, points and
 observations follow from the poses, no picture is drawn. Seconds on one thread and the peak of what Python and numpy
 allocate while the function runs (tracemalloc). `power` is that of the count between the last two columns: 1 is linear.
 """
@@ -39,7 +39,7 @@ from msgs_slam.pipelines.sfm.retrieval import GlobalDescriptors, far_apart, loop
 from msgs_slam.pipelines.tracking.adjust import make_bundle
 from msgs_slam.pipelines.tracking.state import TrackState
 from msgs_slam.pipelines.types import Intrinsics
-from tests.world.building import HEIGHT, LENGTH, ROOM_WIDTH, Walk, module_at
+from tests.benchmarks.worlds.building import HEIGHT, LENGTH, ROOM_WIDTH, Walk, module_at
 
 CAMERA = Intrinsics(320, 240, 272.0, 272.0, 160.0, 120.0)
 SMALL = CAMERA.resized(80, 60)

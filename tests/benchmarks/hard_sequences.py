@@ -97,9 +97,8 @@ def corridor_blank(folder: Path, data: Path) -> Array:
 
 
 def blank_ring(folder: Path, blank_sides: tuple[int, ...]) -> Array:
+    from tests.benchmarks.worlds.corridor import corridor_walk, ring_corridor
     from tests.world.build import build_world
-    from tests.world.corridor import ring_corridor
-    from tests.world.paths import corridor_walk
 
     poses = corridor_walk(np.linspace(0, 1.08, 150))
     world = build_world("corridor", ring_corridor(True, blank_sides), 0, 0.006)

@@ -6,7 +6,7 @@
     python tests/benchmarks/long.py --work RUNS --fps 10 --size 640x480 --focal 0.6 --set mapping.passes=5
     python tests/benchmarks/long.py --work RUNS --poses --size 480x360   structure from motion alone: its error
 
-The walk leads through a building of rooms and corridors that is made as it is read (`tests/world/building.py`): exact
+The walk leads through a building of rooms and corridors that is made as it is read (`worlds/building.py`): exact
 poses, depth and classes. Every stage runs in a process of its own, so that its peak of memory is its own, and its CPU
 seconds, which a crowded machine changes least. What lies finished in RUNS is not done again, so that a longer walk can
 be added to a table later.
@@ -35,8 +35,8 @@ from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.run.files import BACKBONE, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
+from tests.benchmarks.worlds.building import Walk, around, frames
 from tests.world import ClipOptions, write_sequence
-from tests.world.building import Walk, around, frames
 
 
 def make_clip(folder: Path, walk: Walk, camera: dict[str, Any]) -> tuple[Path, Path]:

@@ -12,8 +12,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
+from tests.benchmarks.worlds import LAYOUTS
 from tests.world import ClipOptions, make_world, write_sequence
-from tests.world.clip import LAYOUTS
 
 
 def main() -> None:

@@ -27,9 +27,9 @@ from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import CALIBRATION, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import WORLD
+from tests.benchmarks.worlds.panorama import render_panorama
 from tests.world.build import World
 from tests.world.clip import ClipOptions, make_world, render_frame, render_view, walk
-from tests.world.panorama import render_panorama
 
 Array = NDArray[np.float64]
 NEAR = 0.05

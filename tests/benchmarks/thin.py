@@ -33,8 +33,8 @@ from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import FRAMES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
+from tests.benchmarks.worlds.stairwell import BAR
 from tests.world import ClipOptions, make_world, write_sequence
-from tests.world.stairwell import BAR
 
 OPTIONS = ClipOptions(frames=40, width=400, height=300, laps=0.5, noise=1.0)
 _GAP = 0.045

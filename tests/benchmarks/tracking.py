@@ -182,6 +182,7 @@ def prepare(name: str, case: Case, work: Path) -> Path:
 
 def write_walk(folder: Path, layout: str, texel: float = 0.006, **options: Any) -> Path:
     """A walk in the made-up world as a folder of pictures, with traj.txt beside it."""
+    import tests.benchmarks.worlds  # noqa: F401 (more layouts)
     from tests.world.clip import ClipOptions, make_world
     from tests.world.write import write_sequence
 

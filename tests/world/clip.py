@@ -8,23 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.types import Intrinsics
-from tests.world.build import World, build_world
+from tests.world.build import Scene, World, build_world
 from tests.world.cast import render_rays
-from tests.world.classroom import classroom, classroom_walk
-from tests.world.corridor import ring_corridor
-from tests.world.paths import corridor_walk, room_walk
+from tests.world.paths import room_walk
 from tests.world.room import furnished_room
-from tests.world.stairwell import GLOSS, stairwell, stairwell_walk
 
-LAYOUTS = {"room": furnished_room, "corridor": ring_corridor, "stairwell": stairwell, "classroom": classroom}
+LAYOUTS: dict[str, Callable[[bool], Scene]] = {"room": furnished_room}
 Path = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Laps (N,) -> world_from_cam (N, 4, 4)."""
-_WALKS: dict[str, Path] = {
-    "room": room_walk,
-    "corridor": corridor_walk,
-    "stairwell": stairwell_walk,
-    "classroom": classroom_walk,
-}
+WALKS: dict[str, Path] = {"room": room_walk}
+GLOSSES: dict[str, float] = {}
+"""Of the floor, where it mirrors. `tests/benchmarks/worlds/` adds layouts to all three tables."""
 
 ROWS = 4
 """Of a rolling shutter are taken at once."""
@@ -75,20 +69,19 @@ class WorldFrame:
 
 
 def make_world(layout: str = "room", seed: int = 0, texel: float = 0.005, blank_walls: bool = False) -> World:
-    """A synthetic world with exact truth: "room" (furnished, one table to walk round), "corridor" (repeats itself),
-    "stairwell" (thin bars before other things, over a polished floor) or "classroom" (thirty desks on a plain floor).
+    """A synthetic world with exact truth: "room" (furnished, one table to walk round), or a benchmark's world.
 
     texel: metres per texture pixel on walls. The same arguments give the same bytes.
     """
     if layout not in LAYOUTS:
         raise ValueError(f"layout is one of {', '.join(LAYOUTS)}; got {layout!r}")
     world = build_world(layout, LAYOUTS[layout](blank_walls), seed, texel)
-    return replace(world, gloss=GLOSS) if layout == "stairwell" else world
+    return replace(world, gloss=GLOSSES.get(layout, world.gloss))
 
 
 def walk(world: World, steps: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, 4, 4) world_from_cam at `steps` (N,) laps along the world's closed walk."""
-    return _WALKS[world.layout](steps)
+    return WALKS[world.layout](steps)
 
 
 def render_frame(world: World, options: ClipOptions, index: int) -> WorldFrame:

@@ -3,8 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.world import corridor
-
 EYE_HEIGHT = 1.45
 
 
@@ -24,26 +22,6 @@ def room_walk(steps: NDArray[np.float64]) -> NDArray[np.float64]:
         [-0.35 * np.cos(angle + 0.5), -0.3 * np.sin(angle + 0.5), 0.95 + 0.14 * np.sin(2 * angle + 1.0)], axis=1
     )
     return look_at(center, target, roll=0.03 * np.sin(4 * angle))
-
-
-def corridor_walk(steps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 4, 4) world_from_cam of a walk through the ring, looking ahead and a little to the outer wall."""
-    center = np.concatenate([_ring(steps), np.full((len(steps), 1), EYE_HEIGHT)], axis=1)
-    center[:, 2] += 0.04 * np.sin(18 * np.pi * steps)
-    ahead = np.concatenate([_ring(steps + 0.055), np.full((len(steps), 1), 1.3)], axis=1)
-    outwards = center[:, :2] / np.linalg.norm(center[:, :2], axis=1, keepdims=True)
-    ahead[:, :2] += outwards * (0.35 + 0.25 * np.sin(10 * np.pi * steps))[:, None]
-    return look_at(center, ahead, roll=0.015 * np.sin(12 * np.pi * steps))
-
-
-def _ring(steps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 2) points on a square with rounded corners in the middle of the corridor."""
-    half = (corridor.OUTER + corridor.INNER) / 4
-    angle = 2 * np.pi * (steps - 0.125)
-    # A superellipse: between a circle (2) and a square (infinity), with even curvature changes.
-    c, s = np.cos(angle), np.sin(angle)
-    radius = half / (np.abs(c) ** 7 + np.abs(s) ** 7) ** (1 / 7)
-    return np.stack([radius * c, radius * s], axis=1)
 
 
 def look_at(center: NDArray[np.float64], target: NDArray[np.float64], roll: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -5,9 +5,11 @@ each, and the wear of the plaster and the floor.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tests.world.build import Scene
 from tests.world.light import Light
+from tests.world.paths import EYE_HEIGHT, look_at
 from tests.world.room import DARK, OAK
 from tests.world.shapes import BACK, FRONT, LEFT, RIGHT, ROOM, Material, Solid, box, cylinder
 
@@ -104,3 +106,23 @@ def _ceiling_lamp(side: int, along: float) -> tuple[Solid, Light]:
     radiance = tuple(np.array((5.0, 4.9, 4.6)))
     below = (at[0], at[1], HEIGHT - 0.09)
     return panel, Light(below, (0.3, 0, 0), (0, 0.3, 0), (0.0, 0.0, -1.0), radiance)
+
+
+def corridor_walk(steps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 4, 4) world_from_cam of a walk through the ring, looking ahead and a little to the outer wall."""
+    center = np.concatenate([_ring(steps), np.full((len(steps), 1), EYE_HEIGHT)], axis=1)
+    center[:, 2] += 0.04 * np.sin(18 * np.pi * steps)
+    ahead = np.concatenate([_ring(steps + 0.055), np.full((len(steps), 1), 1.3)], axis=1)
+    outwards = center[:, :2] / np.linalg.norm(center[:, :2], axis=1, keepdims=True)
+    ahead[:, :2] += outwards * (0.35 + 0.25 * np.sin(10 * np.pi * steps))[:, None]
+    return look_at(center, ahead, roll=0.015 * np.sin(12 * np.pi * steps))
+
+
+def _ring(steps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 2) points on a square with rounded corners in the middle of the corridor."""
+    half = (OUTER + INNER) / 4
+    angle = 2 * np.pi * (steps - 0.125)
+    # A superellipse: between a circle (2) and a square (infinity), with even curvature changes.
+    c, s = np.cos(angle), np.sin(angle)
+    radius = half / (np.abs(c) ** 7 + np.abs(s) ** 7) ** (1 / 7)
+    return np.stack([radius * c, radius * s], axis=1)
