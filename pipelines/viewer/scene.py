@@ -21,7 +21,7 @@ from ..geometry.sparse_model import SparseModel
 from ..outcome import Outcome, labels_of_channels, load_outcome, map_cloud, spread_sample
 from ..providers import class_colors
 from ..render.gaussian_map import decided_channels
-from ..run.files import BACKBONE, CALIBRATION, CLASSES, FRAMES, MESH
+from ..run.files import BACKBONE, CALIBRATION, CLASSES, FRAMES
 from ..run.folder import RunFolder, load_records
 from ..scene.upright import cameras_up
 from ..scene.world import WORLD, up_in_run
@@ -164,7 +164,7 @@ def _from_run(outcome: Outcome) -> ViewerScene:
         class_colors=outcome.classes.colors,
         cameras=[ViewerCamera.of(outcome.frames[row], world_from_cam[row], k) for row in rows],
         path=centers * scale,
-        mesh_file=mesh if (mesh := (run.stage("export") / MESH).with_suffix(".glb")).is_file() else None,
+        mesh_file=run.file("export", "mesh.glb") if run.has("export", "mesh.glb") else None,
         world_from_mesh=np.eye(3) if world is None else world.gltf_from_exported.T,
         run=outcome.run,
         world=RUN if world is None else EXPORTED,
