@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from .atomic import write_bytes, write_lines, write_text
 from .errors import InputError
@@ -180,6 +179,8 @@ class _Images:
 
     @staticmethod
     def from_model(m: ColmapModel) -> _Images:
+        from scipy.spatial.transform import Rotation
+
         order = np.argsort(m.obs_image, kind="stable")
         starts = np.searchsorted(m.obs_image[order], np.arange(len(m.names) + 1)).astype(np.int64)
         rotations = nearest_rotation(m.cam_from_world[:, :3, :3])

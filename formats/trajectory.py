@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from .atomic import write_text
 from .errors import InputError
@@ -50,6 +49,8 @@ def write_tum(path: Path, timestamps: NDArray[np.float64], world_from_cam: NDArr
         raise ValueError(f"write_tum: got {n} timestamps and poses of shape {world_from_cam.shape}")
     lines = [f"# {line}" for line in (*note.splitlines(), "timestamp tx ty tz qx qy qz qw")]
     if n:
+        from scipy.spatial.transform import Rotation  # slow to import, and few files need it
+
         quat_xyzw = Rotation.from_matrix(world_from_cam[:, :3, :3]).as_quat(canonical=True)
         for time, t, q in zip(timestamps, world_from_cam[:, :3, 3], quat_xyzw, strict=True):
             lines.append(f"{time:.9f} " + " ".join(f"{value:.9f}" for value in (*t, *q)))
@@ -71,6 +72,8 @@ def poses_from_quaternions(
         raise _no_pose(quat_xyzw, translations, int(np.argmax(bad)), name)
     poses = np.full((len(quat_xyzw), 4, 4), np.nan)
     if known.any():
+        from scipy.spatial.transform import Rotation
+
         poses[known] = np.eye(4)
         poses[known, :3, :3] = Rotation.from_quat(quat_xyzw[known]).as_matrix()
         poses[known, :3, 3] = translations[known]

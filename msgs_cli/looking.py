@@ -53,12 +53,16 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
 def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | None, output: Output) -> None:
     """Compare RUN with ground truth: poses, images, depth, labels, mesh. Writes RUN/evaluation/."""
     from ..formats.datasets import open_sequence
-    from ..pipelines.evaluation.labels import open_class_map
-    from ..pipelines.evaluation.write import evaluation_table, write_evaluation
 
-    joins = open_class_map(class_map) if class_map else None
+    joins = None
+    if class_map:
+        from ..pipelines.evaluation.labels import open_class_map
+
+        joins = open_class_map(class_map)
     run = open_run(run_path)
     sequence = open_sequence(truth, truth_format)
+    from ..pipelines.evaluation.write import evaluation_table, write_evaluation
+
     with on_sigterm(signal.SIG_DFL):
         figures = write_evaluation(run, sequence, output.progress(), class_map=joins)
     say(evaluation_table(figures, with_protocol=False))
@@ -74,12 +78,13 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | No
 @verbosity_options
 def report(run_path: Path, to: Path | None, pdf: bool, output: Output) -> None:
     """Write one HTML file that says what was found, how good it is, and what to film better."""
+    run = open_run(run_path)
     from ..pipelines.evaluation.html import find_browser, print_pdf
     from ..pipelines.evaluation.report import write_report
 
     browser = find_browser() if pdf else ""
     with on_sigterm(signal.SIG_DFL):
-        made = [write_report(open_run(run_path), to, output.progress())]
+        made = [write_report(run, to, output.progress())]
         if pdf:
             made.append(made[0].with_suffix(".pdf"))
             print_pdf(made[0], made[1], browser)
@@ -133,16 +138,17 @@ def render(
     An .mp4 is H.264 where PyAV is installed (pip install 'msgs-slam[hdr]'), else VP9: browsers play both. An .avi or
     .mkv loses nothing (FFV1).
     """
-    from ..pipelines.viewer.render_run import render_file, render_run
-
     is_file = source.is_file() and source.suffix.lower() in SPLAT_FILES
     if is_file and (kind != "color" or camera_path == "own"):
         raise click.UsageError("a splat file has colours and no cameras: --kind color, --path orbit or FILE")
+    run = None if is_file else open_run(source)
+    from ..pipelines.viewer.render_run import render_file, render_run
+
     with on_sigterm(signal.SIG_DFL):
-        if is_file:
+        if run is None:
             made = render_file(source, target, fps, output.progress(), size, camera_path, output.tell)
         else:
-            made = render_run(open_run(source), target, kind, camera_path, fps, output.progress(), size, output.tell)
+            made = render_run(run, target, kind, camera_path, fps, output.progress(), size, output.tell)
     say(made)
     output.tell_result(video=made)
 
@@ -158,6 +164,8 @@ def view(path: Path, port: int, host: str) -> None:
 
     Needs the extra: pip install 'msgs-slam[viewer]'.
     """
+    if path.is_dir():
+        open_run(path)
     from ..pipelines.viewer.server import open_viewer
 
     try:

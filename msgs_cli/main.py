@@ -262,11 +262,12 @@ def export(
     """
     if (config_file or overrides) and to is None:
         raise click.UsageError("add --to DIR: files of other settings (--set, --config) do not go into the run")
-    from ..pipelines.export.stage import export_run
     from ..pipelines.read_config import load_config
     from ..pipelines.reconstruct import made_with
 
     run = open_run(run_path)
+    from ..pipelines.export.stage import export_run
+
     settings = load_config(config_file, overrides, base=made_with(run)).export
     kind, folder = _COMES_WITH.get(only or "", only), to or run.stage("export")
     with on_sigterm(signal.SIG_DFL):
@@ -298,11 +299,10 @@ def demo(
     **given: str | int | None,
 ) -> None:
     """Reconstruct a synthetic test clip and print its errors against ground truth."""
+    config = chosen_config(config_file, overrides, given)
     from ..pipelines.demo import demo_summary, run_demo
     from ..pipelines.reconstruct import reconstruct as run_reconstruct
     from ..pipelines.run.folder import RunFolder
-
-    config = chosen_config(config_file, overrides, given)
 
     def reconstruct_clip(video: Path, run: RunFolder) -> None:
         with output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"):

@@ -139,9 +139,7 @@ def check(names: tuple[str, ...]) -> None:
     Compares input, outputs, sizes, units and ranges of values with what the card says; exit code 1 where it is wrong.
     """
     from ..formats.errors import InputError
-    from ..pipelines.demo import known_view
     from ..pipelines.networks.card import read_card
-    from ..pipelines.networks.check import check_network
     from ..pipelines.networks.registry import ModelStore
 
     store = ModelStore.open()
@@ -151,6 +149,9 @@ def check(names: tuple[str, ...]) -> None:
     cards = own | {m.name: store.card(m) for m in with_card if chosen or store.is_here(m)}
     if not cards:
         raise InputError(f"no network with a card is in {store.cache}; run: msgs-slam models pull")
+    from ..pipelines.demo import known_view
+    from ..pipelines.networks.check import check_network
+
     view = known_view()
     found = {name: check_network(card, view) for name, card in cards.items()}
     for name, findings in found.items():

@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +30,15 @@ if TYPE_CHECKING:
     from .pipelines.types import Intrinsics
 
 __all__ = ["InputError", "Run", "__version__", "main", "open_run", "reconstruct"]
-__version__ = version("msgs-slam")
+
+
+def __getattr__(name: str) -> str:
+    """`__version__`, by what pip knows of the program: asking takes longer than the rest of this module."""
+    if name != "__version__":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib.metadata import version
+
+    return version("msgs-slam")
 
 
 @dataclass(frozen=True)

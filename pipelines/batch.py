@@ -17,10 +17,10 @@ from ..formats.images import VIDEO_SUFFIXES
 from ..formats.textfile import write_json
 from .config import STAGES, Config
 from .engine.placement import Command, Placement
-from .outcome import keyframe_psnr
 from .reconstruct import existing_config, reconstruct
 from .run.folder import RunFolder, load_records
 from .run.lock import RunBusyError
+from .run.manifest import keyframe_psnr
 from .system.progress import Progress, log
 from .system.wording import markdown_table
 

@@ -7,6 +7,7 @@ STAGES = ("frames", "proxy", "tracking", "mapping", "global_ba", "export")
 EXPORTS = (
     "colmap", "ply", "spz", "sog", "glb", "tiles", "html", "mesh", "obj", "collision", "usd", "floorplan", "tum",
 )  # fmt: skip
+GPS_OFF, GPS_AUTO = "off", "auto"
 EXTENSION = "extension_"
 """Begins the folder of a run in which what it was before it was extended is kept."""
 SOURCE_LIST = "source.videos"

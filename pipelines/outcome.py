@@ -34,7 +34,7 @@ from .run.files import (
     TRAJECTORY,
 )
 from .run.folder import RunFolder, load_records, load_settings, load_source
-from .run.manifest import StageRecord, recorded_config
+from .run.manifest import StageRecord, keyframe_psnr, recorded_config
 from .system.device import resolve_device
 from .system.wording import quoted
 from .types import VOID, Calibration, ClassTable, Frame, Metres, Trajectory
@@ -145,14 +145,6 @@ class Outcome:
     def frame_row(self, frame_id: int) -> int:
         """Row of a frame in the trajectory."""
         return int(np.flatnonzero(self.trajectory.frame_ids == frame_id)[0])
-
-
-def keyframe_psnr(records: Mapping[str, StageRecord]) -> float | None:
-    """The PSNR of a run, dB: mean over the keyframes that made the map, each drawn with its exposure at the size that
-    the map was made at, against what it shows of the scene; as the last stage that changed the map measured it. None
-    before mapping is done."""
-    figures = (records[name].figures for name in ("global_ba", "mapping") if name in records)
-    return next((found for f in figures if (found := f.get("keyframe_psnr")) is not None), None)
 
 
 def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:

@@ -11,32 +11,46 @@ from ..formats.reading import require_listable, require_unicode
 from ..formats.video import probe_video
 from .config import SOURCE_LIST, STAGES, Config, overridden, with_method
 from .engine.runner import run_stages
-from .engine.stages import Stage, TaskWorkers
-from .engine.tasks import BETWEEN_LOOKS, Shard, SharedWorkers, boards_in, set_threads
+from .engine.stages import Later, Stage, TaskWorkers
+from .engine.tasks import BETWEEN_LOOKS, Shard, SharedWorkers, boards_in
+from .export.inputs import check_export, export_inputs
+from .frames.inputs import check_frames, frames_division, frames_inputs
+from .mapping.division import mapping_division, mapping_inputs
+from .paper.constants import paper_inputs
+from .proxy.inputs import check_proxy, left_to_auto, proxy_inputs
 from .read_config import with_absolute_paths
 from .run.folder import RunFolder, load_records, load_settings, load_source
 from .run.lock import LEADER, LOCK, NotedProgress, RunBusyError, locked, make_folder
 from .run.manifest import StageRecord, recorded_config
 from .source.opening import source_digest
-from .system.device import resolve_device
+from .system.device import require_device
 from .system.memory import available_cpus
 from .system.progress import Progress, log, stop_if_asked
 from .system.wording import quoted
 
 
 def all_stages(method: str = "default") -> list[Stage]:
-    """The stages of a method (`run.method`) in order. Imported here so that asking for help does not load torch."""
-    from .export.stage import STAGE as export
-    from .frames.stage import STAGE as frames
-    from .global_ba.stage import STAGE as global_ba
-    from .mapping.stage import STAGE as mapping
-    from .proxy.stage import STAGE as proxy
-    from .tracking.stage import STAGE as tracking
-
-    between = [tracking, mapping, global_ba]
+    """The stages of a method (`run.method`) in order. Nothing that computes is imported before a stage runs."""
+    between = [
+        Stage("tracking", Later("tracking.stage")),
+        Stage("mapping", Later("mapping.stage"), inputs=mapping_inputs, division=mapping_division),
+        Stage("global_ba", Later("global_ba.stage")),
+    ]
     if method == "paper":
-        from .paper.stages import STAGES as between
-    return [frames, proxy, *between, export]
+        functions = {"tracking": "track", "mapping": "map_keyframes", "global_ba": "close_and_adjust"}
+        between = [Stage(name, Later("paper.stages", function), paper_inputs) for name, function in functions.items()]
+    return [
+        Stage(
+            "frames", Later("frames.stage"), frames_inputs, check_frames,
+            auto=lambda config: ("people",) if config.frames.people == "auto" else (), division=frames_division,
+        ),
+        Stage("proxy", Later("proxy.stage"), proxy_inputs, check_proxy, left_to_auto),
+        *between,
+        Stage(
+            "export", Later("export.stage"), export_inputs, check_export,
+            auto=lambda config: ("metres",) if config.export.scale == "auto" else (),
+        ),
+    ]  # fmt: skip
 
 
 def default_run_folder(source: Path) -> RunFolder:
@@ -104,7 +118,7 @@ def reconstruct(
     config = _settled(config)
     digest = source_digest(source, config.run.format)
     _require_run_or_empty(run)
-    resolve_device(config.run.device)  # refused before anything is written
+    require_device(config.run.device)  # refused before anything is written
     with locked(run):
         _require_same_source(run, source, digest)
         return _run(run, source.resolve(), digest, config, progress, until, workers, threads)
@@ -138,7 +152,7 @@ def resume(
     origin = load_source(run)
     source = Path(origin.path)
     config = _settled(config or load_settings(run))
-    resolve_device(config.run.device)
+    require_device(config.run.device)
     with locked(run):
         once_locked()
         return _run(run, source, origin.digest, config, progress, until, workers, redo=redo)
@@ -192,14 +206,14 @@ def extend(run: RunFolder, videos: Sequence[Path], progress: Progress) -> dict[s
     Raises InputError, with nothing changed, for a run that is not finished, another camera, and a video in which
     nothing of the run is recognised.
     """
+    require_run(run)
     from .tracking.extend_run import add_videos, is_added, require_extendable
 
-    require_run(run)
     if run.is_piece or is_added(run, videos):
         return resume(run, progress)
     with locked(run):
         config = load_settings(run)
-        resolve_device(config.run.device)
+        require_device(config.run.device)
         require_extendable(run, videos, config, progress)
         source = add_videos(run, videos, config)
         return _run(run, Path(source.path), source.digest, config, progress, STAGES[-1], None)
@@ -250,7 +264,6 @@ def _run(
             )
 
     threads = config.run.threads or (workers.threads if workers else threads) or available_cpus()
-    set_threads(threads)
     with NotedProgress(progress, run) as noted:
         stages = all_stages(config.run.method)
         return run_stages(stages, run, source, digest, config, noted, until, same_source, workers, threads, redo)

@@ -10,6 +10,7 @@ from ..formats.errors import InputError
 from .config import STAGES, Config, ProxyConfig
 from .engine.stages import Stage
 from .engine.staleness import changed_auto_choices, next_upstream, rerun_reason
+from .mapping.division import submap_count
 from .masks.people import people_cards
 from .networks.card import Card
 from .networks.registry import ModelStore, metric_card
@@ -214,8 +215,6 @@ def about_new_networks(run: RunFolder, program: Program) -> str:
 def expected_mb(stage: str, run: RunFolder, config: Config) -> float | None:
     """MB that a stage will need about, or has needed, by the keyframes that `frames` has found. A map in submaps needs
     that of one submap at a time."""
-    from .mapping.submaps import submap_count
-
     try:
         camera, found = run.load(CALIBRATION).intrinsics, load_records(run)["frames"].figures
     except InputError:  # damaged, which is reported elsewhere

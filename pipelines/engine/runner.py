@@ -28,7 +28,8 @@ from .staleness import (
     rerun_reason,
     stage_fingerprint,
 )
-from .time_left import TimeLeft, work_of
+from .tasks import set_threads
+from .time_left import USUAL, TimeLeft, work_of
 
 _PROCESS = Path("/proc/self")
 
@@ -110,8 +111,10 @@ class StageReporter:
         """Report that a stage has come into a state."""
         index, figures = self._names.index(name) + 1, record.figures if record else {}
         seconds, of_work = record.seconds if record else 0.0, ""
-        if name == STAGES[0] and state in (ENDED, UP_TO_DATE):  # what there is to do is known from here on
-            self._left.work = work_of(self._config, (record or self._records[name]).figures)
+        # What there is to do is known as soon as the first stage is done; nobody asks where all is up to date.
+        first = record if name == STAGES[0] else self._records.get(STAGES[0])
+        if state in (BEGUN, ENDED) and first is not None and self._left.work is USUAL:
+            self._left.work = work_of(self._config, first.figures)
             of_work = self._left.work.text
         if state == (ENDED if name == STAGES[0] else BEGUN) and name != self._names[-1]:
             self._left.measure()
@@ -121,6 +124,7 @@ class StageReporter:
     @contextmanager
     def running(self, name: str) -> Iterator[Callable[[StageRecord], None]]:
         """The stage runs in this block, which hands its record over at its end."""
+        set_threads(self._config.run.threads)  # this machine is measured with as many
         self._left.begin(name)
         self.report(name, BEGUN)
 
@@ -148,7 +152,7 @@ def _check_inputs(
 
     A finished stage whose inputs are gone (files deleted, a model removed) stays as it is.
     """
-    inputs, records = {}, load_records(run)
+    inputs, checks, records = {}, [], load_records(run)
     settled = True
     for stage in stages:
         record = records.get(stage.name)
@@ -168,7 +172,9 @@ def _check_inputs(
         if stage is stages[0] and not settled:
             same_source()
         if stage.check and not settled:
-            stage.check(source, config)
+            checks.append(stage.check)
+    for check in checks:  # these open networks and read files, which takes longer than what is refused above
+        check(source, config)
     return inputs
 
 

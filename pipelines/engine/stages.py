@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -105,6 +107,35 @@ class StageContext:
 
 
 @dataclass(frozen=True)
+class Later:
+    """A function of a module below pipelines/ that is imported when it is called: who only asks for a run's state does
+    not wait for torch and COLMAP."""
+
+    module: str
+    name: str = "run"
+
+    @property
+    def _whole(self) -> str:
+        return f"{__name__.rpartition('.engine.')[0]}.{self.module}"
+
+    @property
+    def function(self) -> Callable[..., Any]:
+        """The function; imports its module."""
+        function: Callable[..., Any] = getattr(import_module(self._whole), self.name)
+        return function
+
+    def __call__(self, *args: Any) -> Any:
+        """Call the function."""
+        return self.function(*args)
+
+    @property
+    def file(self) -> Path:
+        """Path of the module."""
+        spec = find_spec(self._whole)
+        return Path(str(spec and spec.origin))
+
+
+@dataclass(frozen=True)
 class Stage:
     """`run` does the work and returns its key figures; what code it is follows from its module (`stage_identity`).
 
@@ -126,7 +157,7 @@ class Stage:
     @property
     def file(self) -> Path:
         """The module of `run`."""
-        return Path(self.run.__code__.co_filename)
+        return self.run.file if isinstance(self.run, Later) else Path(self.run.__code__.co_filename)
 
 
 def stopping_after_writes(folder: Path) -> AbstractContextManager[None]:

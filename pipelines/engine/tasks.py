@@ -16,7 +16,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib.metadata import PackageNotFoundError, version
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
@@ -284,6 +283,8 @@ def require_same_world(folders: Sequence[Path], code: str) -> None:
 @functools.cache
 def code_identity() -> str:
     """List what results depend on: the program's stages, Python, the libraries that compute; name=version of each."""
+    from importlib.metadata import PackageNotFoundError, version
+
     stages = " ".join(stage_identity(name, stage_file(name)) for name in STAGES)
     program = hashlib.sha256(stages.encode()).hexdigest()
     found = {"msgs-slam": program, "Python": platform.python_version()}
@@ -296,7 +297,9 @@ def code_identity() -> str:
 
 
 def set_threads(threads: int) -> None:
-    """Let the libraries of this process use so many CPU threads."""
+    """Let the libraries of this process use so many CPU threads; 0 leaves it to them."""
+    if threads == 0:
+        return
     import cv2
     import scipy.linalg  # noqa: F401 (loads a BLAS of its own, whose threads are limited below)
     import torch

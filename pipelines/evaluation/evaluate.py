@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from ...formats.datasets import Sequence
 from ...formats.errors import InputError
 from ..geometry import se3
-from ..mapping.load import split_frames
+from ..mapping.division import split_frames
 from ..outcome import Outcome, spread_sample
 from ..render.api import Rendering, render
 from ..sfm.lens import FramePixels

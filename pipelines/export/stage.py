@@ -7,18 +7,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ...formats.gps import read_track
 from ...formats.mesh import mesh_blocks
-from ...formats.reading import file_sha256
-from ..config import Config, ExportConfig
-from ..engine.stages import Stage, StageContext
+from ..config import ExportConfig
+from ..engine.stages import StageContext
 from ..networks.registry import metric_card
-from ..networks.session import card_identity
 from ..outcome import Outcome, load_outcome
 from ..run.ending import empty
 from ..run.files import METRES, SUBMAPS
 from ..run.folder import RunFolder
-from ..scene.gps import AUTO, OFF, world_on_earth
+from ..scene.gps import world_on_earth
 from ..scene.metres import find_metres
 from ..scene.upright import find_upright
 from ..scene.world import FIRST, WORLD, World, upright_world, world_figures
@@ -102,14 +99,6 @@ def on_earth(outcome: Outcome, world: World) -> Outcome:
     return outcome if world.earth is None else replace(outcome, metric=True, metres=None)
 
 
-def export_inputs(source: Path, config: Config) -> dict[str, str] | None:
-    """The network that the guess is made with, and the track: other fixes under the same name make other files."""
-    card = metric_card() if config.export.scale == "auto" else None
-    metres = {} if card is None else {"metres": card_identity(card)}
-    track = {} if config.export.gps in (AUTO, OFF) else {"track": file_sha256(Path(config.export.gps))}
-    return metres | track or None
-
-
 def find_world(outcome: Outcome, settings: ExportConfig) -> tuple[World, list[str]]:
     """The world for the files of a run whose map is done, and what could not be found that was asked for."""
     world = upright_world(outcome, find_upright(outcome)) if settings.axes == "up" else FIRST
@@ -121,12 +110,6 @@ def find_world(outcome: Outcome, settings: ExportConfig) -> tuple[World, list[st
         )
     world, reason = world_on_earth(outcome, world, settings.gps)
     return world, [*reasons, reason] if reason else reasons
-
-
-def _check(source: Path, config: Config) -> None:
-    """The track that the user gives can be read."""
-    if config.export.gps not in (AUTO, OFF):
-        read_track(Path(config.export.gps))
 
 
 def write_all_but_mesh(outcome: Outcome, world: World, settings: ExportConfig, folder: Path) -> list[Path]:
@@ -193,12 +176,3 @@ def _kept_world(outcome: Outcome, settings: ExportConfig) -> World | None:
     """That of the run's own export, so that what is written later or elsewhere fits; None for other axes."""
     own = outcome.config.export
     return outcome.run.find(WORLD) if (settings.axes, settings.gps) == (own.axes, own.gps) else None
-
-
-STAGE = Stage(
-    "export",
-    run,
-    inputs=export_inputs,
-    check=_check,
-    auto=lambda config: ("metres",) if config.export.scale == "auto" else (),
-)

@@ -14,7 +14,6 @@ from ...formats.reading import file_sha256
 from ..config import FramesConfig
 from ..networks.registry import Model, ModelStore
 from ..networks.runtime import Runtime, open_runtime
-from ..sfm.features import extract_features, to_grey
 from ..types import Features
 
 EXTRACTOR, MATCHER = "aliked-n16rot", "aliked-lightglue"
@@ -90,6 +89,8 @@ def picture_features(
     """Features of an (H, W, 3) image, of the kind that the settings ask for."""
     if learned is not None:
         return learned.extract(rgb, settings.max_features, left_out)
+    from ..sfm.features import extract_features, to_grey  # imports pycolmap
+
     return extract_features(to_grey(rgb), settings.max_features, left_out)
 
 

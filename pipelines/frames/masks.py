@@ -1,9 +1,11 @@
 """Masks of the frames: files of the user, read as the source reads its images, and people found by networks."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -18,11 +20,13 @@ from ..geometry.camera import ONE_CAMERA, Rig
 from ..masks.people import PeopleCards, PeopleFinder, people_cards
 from ..networks.registry import ModelStore
 from ..run.files import LEFT_OUT
-from ..sfm.lens import Lens
-from ..source.faces import Faces
 from ..source.opening import FolderSource, Source, VideoSource, open_source
 from ..system.progress import Progress
 from ..types import Frame, any_of
+
+if TYPE_CHECKING:
+    from ..sfm.lens import Lens
+    from ..source.faces import Faces
 
 _LITTLE, _LOOKED_AT = 0.05, 40
 """Share of an image that masks leave, in the middle of so many, below which they are the reason where nothing is found.

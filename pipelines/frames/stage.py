@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,15 +11,13 @@ from numpy.typing import NDArray
 from ...formats.atomic import copy_file
 from ...formats.errors import InputError, RecoverableError
 from ...formats.gps import photo_places
-from ...formats.image_folder import hint_at_inner_folder
 from ...formats.images import read_rgb, write_rgb
 from ...formats.textfile import read_json, write_json
 from ...formats.video import VideoFrame
-from ..config import Config
-from ..engine.stages import Stage, StageContext
+from ..engine.stages import StageContext
 from ..engine.tasks import in_chunks
 from ..geometry.camera import Rig, rig_of
-from ..run.extension import parent_inputs, parent_of
+from ..run.extension import parent_of
 from ..run.files import (
     BACKBONE,
     CALIBRATION,
@@ -31,23 +28,21 @@ from ..run.files import (
     VOCABULARY,
     save_frames,
 )
-from ..run.folder import RunFolder, load_records
 from ..sfm.bridges import Picture
 from ..sfm.driver import Structure
 from ..sfm.lens import Lens, distortion_of, make_lens
 from ..sfm.parallax import require_motion
-from ..sfm.rolling import read_readout, straight_copy
+from ..sfm.rolling import straight_copy
 from ..source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
-from ..source.given import check_poses, given_poses, intrinsics_inputs, pose_inputs, read_intrinsics
-from ..source.opening import FolderSource, Source, Warn, open_source
+from ..source.given import given_poses
+from ..source.opening import FolderSource, Source, open_source
 from ..source.sharpness import reduce_image
-from ..system.memory import window_size, windows_of
 from ..system.parallel import parallel_map
 from ..types import Calibration, Frame, GivenPoses
 from .findings import in_world_of, settled_origin, to_sparse_model, warn_of_focal, warn_of_given, warn_of_structure
+from .inputs import require_several
 from .keyframes import KeyframeChoice, choose_keyframes, pick_frames
-from .learned import learned_inputs, open_learned
-from .masks import FrameMasks, check_masks, mask_inputs
+from .masks import FrameMasks
 from .priors import solve
 from .tasks import (
     TASKS,
@@ -72,7 +67,7 @@ def run(context: StageContext) -> dict[str, Any]:
             "the images are twice as wide as high, like 360° panoramas: if they are, pass --camera equirectangular"
         )
     camera, origin = known_camera(context, source, faces)
-    _require_several(source, context.warn)
+    require_several(source, context.warn)
     frames = pick_frames(context, source, faces)
     given = given_poses(context.config.frames, source, frames, context.warn)
     rig = rig_of(1 if faces is None else len(faces), len(frames))
@@ -112,46 +107,6 @@ def places_figure(source: Source, frames: list[Frame]) -> dict[str, str]:
     places = photo_places([source.file(frame.source_index) for frame in frames])
     count = int(np.isfinite(places[:, :2]).all(axis=1).sum())
     return {"gps": f"of {count} of {len(frames)} images"} if count else {}
-
-
-def check(source: Path, config: Config) -> None:
-    """Raise InputError for a source, or a camera given for it, that cannot be used."""
-    opened = open_source(source, config.run.format)
-    _require_several(opened)
-    check_masks(source, config)
-    open_learned(config.frames)
-    read_readout(config.frames.rolling_shutter)
-    faces = find_faces(opened, config.frames)
-    if faces is None and config.frames.intrinsics:
-        read_intrinsics(config.frames.intrinsics, opened.width, opened.height)
-    if faces is not None and len(faces) > 1:
-        _check_panoramas(config)
-    check_poses(config.frames, opened)
-
-
-def _check_panoramas(config: Config) -> None:
-    """What knows pixels of the source's own pictures does not know its panoramas."""
-    if config.frames.poses:
-        raise InputError("--poses cannot be used with panoramas, which are cut into several images first: omit it")
-    files = [p for p in (config.proxy.depth, config.proxy.semantics) if p.startswith("files")]
-    reference = config.proxy.scale_ref.strip()
-    if files or (reference and not reference.startswith("height")):
-        what = f"{files[0]!r}" if files else f"--scale-ref {reference}"
-        raise InputError(
-            f"{what} cannot be used with panoramas, which are cut into several images first: omit it. For metres, give "
-            "--scale-ref height=METRES, the height of the camera above the floor"
-        )
-
-
-def _require_several(source: AnySource, warn: Warn | None = None) -> None:
-    if not isinstance(source, FolderSource):
-        return
-    hint = hint_at_inner_folder(source.path, source.expected_frames + 1)
-    if len(source.headers.of) < 2:
-        needed = f"holds one image only; a reconstruction needs several views of a scene{hint and ': '}{hint}"
-        raise InputError(f"{source.path} {needed}")
-    if hint and warn is not None:
-        warn(f"{source.path} holds {source.expected_frames} images; {hint} if those are meant")
 
 
 # keyframes and structure ----------------------------------------------------------------------------------------
@@ -314,24 +269,3 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
         "readout_seconds": round(sum(calibration.readout), 5),
         "sharpness": round(float(np.median([f.sharpness for f in frames])), 2),
     }
-
-
-def _inputs(source: Path, config: Config) -> dict[str, str] | None:
-    settings = config.frames
-    given = pose_inputs(settings) | intrinsics_inputs(settings.intrinsics)
-    return (mask_inputs(source, config) or {}) | learned_inputs(settings) | given | parent_inputs(source) or None
-
-
-def _division(run: RunFolder, config: Config) -> list[range]:
-    """The windows of structure from motion, which are smaller for less memory: other ones give other poses."""
-    calibration, figures = run.load(CALIBRATION), load_records(run)["frames"].figures
-    pixels = calibration.intrinsics.width * calibration.intrinsics.height
-    size = window_size(config.run.memory_mb, pixels)
-    return windows_of(figures.get("keyframes", 0), size) if calibration.directions == 1 else []
-
-
-STAGE = Stage(
-    "frames", run,
-    inputs=_inputs, check=check, auto=lambda config: ("people",) if config.frames.people == "auto" else (),
-    division=_division,
-)  # fmt: skip

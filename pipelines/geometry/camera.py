@@ -1,16 +1,20 @@
 """Rigid pinhole cameras: projection, images resampled to another size, and rigs of cameras: each panorama is the six
 sides of a cube about its centre."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ..types import Intrinsics, ProxyMaps, require_shape
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Array = NDArray[np.float64]
 
@@ -63,7 +67,7 @@ def project_gaussians(
     them. An isotropic Gaussian stays isotropic: the focal length of its radius is the geometric mean of fx and fy.
     """
     x, y, z = means_in_cam.unbind(-1)
-    inverse_depth = torch.where(z > near, z, torch.ones_like(z)).reciprocal()
+    inverse_depth = z.where(z > near, z.new_ones(())).reciprocal()
     u = intrinsics.fx * (x * inverse_depth) + intrinsics.cx
     v = intrinsics.fy * (y * inverse_depth) + intrinsics.cy
     sigma_px = (intrinsics.fx * intrinsics.fy) ** 0.5 * (radii * inverse_depth)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.spatial import cKDTree
 
 from ..types import require_shape, rows_by
-from .se3 import Similarity
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+    from scipy.spatial import cKDTree
+
+    from .se3 import Similarity
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,8 @@ class SparseModel:
     @cached_property
     def tree(self) -> cKDTree:
         """Search tree over `centers`."""
+        from scipy.spatial import cKDTree
+
         return cKDTree(self.centers)
 
     @cached_property
@@ -65,6 +71,8 @@ class SparseModel:
     @cached_property
     def seen(self) -> csr_matrix:
         """(N, P) bool: which keyframe observes which point."""
+        from scipy.sparse import csr_matrix
+
         shape = len(self.frame_ids), len(self.points_in_world)
         return csr_matrix((np.ones(len(self.obs_frame), bool), (self.obs_frame, self.obs_point)), shape)
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ...formats.atomic import copy_file
 from ..depth.align import sample_proxy
-from ..engine.stages import Stage, StageContext
+from ..engine.stages import StageContext
 from ..geometry import se3
 from ..geometry.sparse_model import SparseModel
 from ..mapping.build import Refined, refine_map
@@ -257,6 +257,3 @@ def save(
         "joint_psnr_after": None if refined is None else round(refined.psnr_after, 3),
     }
     return figures, trajectory
-
-
-STAGE = Stage("global_ba", run)

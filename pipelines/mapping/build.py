@@ -17,8 +17,8 @@ from ..run.files import CALIBRATION, CLASS_IDS, DEPTH_FIELDS, EXPOSURE, SUBMAPS
 from ..run.folder import RunFolder
 from ..system.memory import submap_size
 from ..types import Trajectory
+from .division import split_frames, submap_count
 from .extending import GROWN, grow_submap
-from .load import split_frames
 from .measure import ViewFigures
 from .move_map import interpolate_rows, move_trajectory, rows_of
 from .state import Exposures, OptimisedMap
@@ -34,7 +34,7 @@ from .submap_tasks import (
     in_order,
     measure_submap,
 )
-from .submaps import Submap, divide, submap_count
+from .submaps import Submap, divide
 
 
 @dataclass(frozen=True)

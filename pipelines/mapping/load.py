@@ -18,6 +18,7 @@ from ..run.folder import RunFolder
 from ..system.memory import VIEWS_SHARE, room_on
 from ..system.parallel import LruSequence
 from ..types import Frame, Intrinsics, ProxyMaps, Trajectory
+from .division import split_frames
 from .views import View, make_view, occurring_classes
 
 _COMPARED_ROOM = 60e6
@@ -121,13 +122,3 @@ def load_view(
     """One frame as a view."""
     image, left_out = run.image(frame), run.left_out(frame)
     return make_view(frame.id, intrinsics, cam_from_world, image, maps, class_ids, device, left_out)
-
-
-def split_frames(trajectory: Trajectory, hold_out: int) -> tuple[list[int], list[int]]:
-    """(ids of keyframes to use, ids held out of the placed frames: every `hold_out`-th, from half of that on)."""
-    posed = trajectory.frame_ids[trajectory.is_placed].tolist()
-    keyframes = trajectory.frame_ids[trajectory.is_keyframe].tolist()
-    if hold_out <= 0:
-        return keyframes, []
-    held = [i for i in posed if i % hold_out == hold_out // 2]
-    return [i for i in keyframes if i not in set(held)], held

@@ -1,20 +1,16 @@
 """Stage 4: the semantic Gaussian map from the keyframes (MSGS-SLAM 3.4)."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from ...formats.errors import InputError
-from ..config import Config
-from ..engine.stages import Stage, StageContext
-from ..run.extension import parent_inputs, parent_of
-from ..run.files import CALIBRATION, EXPOSURE, FIGURES, MAP, TRAJECTORY
-from ..run.folder import RunFolder
-from ..system.memory import submap_size
+from ..engine.stages import StageContext
+from ..run.extension import parent_of
+from ..run.files import EXPOSURE, FIGURES, MAP, TRAJECTORY
 from .build import Mapped, build_map
-from .load import split_frames, survey, with_rigid_panoramas
+from .division import split_frames
+from .load import survey, with_rigid_panoramas
 from .measure import mean_figures
-from .submaps import submap_count
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -66,16 +62,3 @@ def _figures(mapped: Mapped) -> dict[str, Any]:
         **mean_figures(mapped.keyframes, "keyframe"),
         **mean_figures(mapped.held_out, "held_out"),
     }
-
-
-def _division(run: RunFolder, config: Config) -> int:
-    """Into how many submaps; more for less memory."""
-    kept, _ = split_frames(run.load(TRAJECTORY, "tracking"), config.mapping.hold_out)
-    return submap_count(len(kept), submap_size(config, run.load(CALIBRATION).intrinsics))
-
-
-def _inputs(source: Path, config: Config) -> dict[str, str] | None:
-    return parent_inputs(source) or None
-
-
-STAGE = Stage("mapping", run, inputs=_inputs, division=_division)

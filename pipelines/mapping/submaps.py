@@ -11,6 +11,7 @@ from scipy import sparse
 from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
 from ..geometry.posed_depth import PosedDepth
+from .division import submap_count
 
 BORDER = 16
 """Keyframes of other submaps that a submap is made with beside its own."""
@@ -63,11 +64,6 @@ def divide(frame_ids: Ids, overlap: sparse.csr_matrix, size: int) -> list[Submap
     for number, part in enumerate(parts):
         of[part] = number
     return [_with_border(frame_ids, shared, of, number) for number in range(len(parts))]
-
-
-def submap_count(keyframes: int, size: int) -> int:
-    """Return the number of submaps for this many keyframes."""
-    return max(1, round(keyframes / size)) if size else 1
 
 
 def _halve(shared: sparse.csr_matrix, rows: Ids, parts: int) -> list[Ids]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import shutil
@@ -16,7 +17,6 @@ from ...formats.errors import InputError
 from ...formats.reading import file_sha256, reaching, require_file
 from ...formats.textfile import read_json_object, write_json
 from .card import Card, card_from_values
-from .download import fetch
 
 _TABLE = Path(__file__).with_name("registry.toml")
 _NOT_IN_CARDS = ("suffix", "ade20k", "metres_only")
@@ -56,7 +56,7 @@ class ModelStore:
     @staticmethod
     def open(cache: Path | None = None, table: Path = _TABLE) -> ModelStore:
         """The store of this user. `MSGS_SLAM_CACHE` names another cache folder."""
-        values = tomllib.loads(table.read_text(encoding="utf-8"))
+        values = _parsed(table.read_text(encoding="utf-8"))
         rows = [Model(**{**row, "urls": _addresses(row)}) for row in values["model"]]
         store = ModelStore(cache or default_cache(), tuple(rows), values["family"])
         own = store._load_own()
@@ -174,6 +174,8 @@ class ModelStore:
                 f"{model.name} is not in {self.cache} and this is offline. Pull it where there is a network"
             )
         try:
+            from .download import fetch  # imports the network's libraries
+
             actual = fetch(model.urls, path, model.bytes, model.sha256, progress)
         except InputError as error:
             if model.revision or not model.sha256 or "expected" not in str(error):
@@ -253,6 +255,11 @@ class ModelStore:
 
     def _save_own(self, own: dict[str, Any]) -> None:
         write_json(self.cache / "own.json", own)
+
+
+@functools.cache
+def _parsed(text: str) -> dict[str, Any]:
+    return tomllib.loads(text)
 
 
 def metric_card() -> Card | None:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError, install_command
@@ -165,6 +164,8 @@ def load_linear_head(path: Path, classes: int) -> LinearHead:
 
     Only tensors are read from the file, never code. Raises InputError for anything else than such a head.
     """
+    import torch
+
     size = require_file(path, _MAX_BYTES)
     with parsing(path, "linear segmentation head", "pull it again"):
         if zipfile.is_zipfile(path):

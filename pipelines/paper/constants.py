@@ -1,6 +1,9 @@
 """Constants of the paper by its own names, with the values of its section 4.1 (or of the text around the equation)."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from ..config import Config
 
 
 @dataclass(frozen=True)
@@ -81,3 +84,16 @@ class Constants:
 
 
 PAPER = Constants()
+
+
+def constants_of(config: Config) -> Constants:
+    """Take the paper's constants, with κ of the settings and without what these switch off: the depth terms."""
+    chosen = replace(PAPER, kappa=config.run.kappa)
+    if config.mapping.use_proxy_depth and config.mapping.depth_weight > 0:
+        return chosen
+    return replace(chosen, track_depth=0.0, map_depth=0.0)
+
+
+def paper_inputs(source: Path, config: Config) -> dict[str, float]:
+    """Constants come from settings of other stages too."""
+    return asdict(constants_of(config))

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..config import Config
 from ..depth.fields import DepthFields
 from ..engine.stages import StageContext
 from ..geometry import se3
@@ -23,7 +21,6 @@ from ..run.files import CALIBRATION, FRAMES
 from ..system.memory import VIEWS_SHARE
 from ..system.parallel import LruSequence
 from ..types import Frame, Intrinsics, Trajectory
-from .constants import PAPER, Constants
 from .gaussians import scaled_depth
 from .uncertainty import proxy_depth
 
@@ -56,14 +53,6 @@ class Recording:
         """Return a frame's view with its proxy depth brought into the world by its field."""
         view = self.views[frame_id]
         return scaled_depth(view, torch.from_numpy(fields.scales(frame_id, *view.depth.shape)))
-
-
-def constants_of(config: Config) -> Constants:
-    """Take the paper's constants, with κ of the settings and without what these switch off: the depth terms."""
-    chosen = replace(PAPER, kappa=config.run.kappa)
-    if config.mapping.use_proxy_depth and config.mapping.depth_weight > 0:
-        return chosen
-    return replace(chosen, track_depth=0.0, map_depth=0.0)
 
 
 def trajectory_of(

@@ -5,8 +5,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,8 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ...formats.tensors import load_tensors, save_tensors
-from ..config import Config
 from ..depth.fields import DepthFields
-from ..engine.stages import Stage, StageContext
+from ..engine.stages import StageContext
 from ..geometry.se3 import Similarity
 from ..global_ba.candidates import summarise_labels
 from ..mapping.measure import ViewFigures, mean_figures, measure_view
@@ -39,10 +37,11 @@ from ..system.progress import is_asked
 from ..system.wording import stretches
 from ..types import LoopEdge, Trajectory
 from .adjustment import carry, global_adjustment, local_adjustment, pose_graph
+from .constants import constants_of
 from .gaussians import Gaussians
 from .loops import candidates, close, small_looks
 from .mapping import draw_together, optimise
-from .recording import Recording, constants_of, sparse_model, trajectory_of
+from .recording import Recording, sparse_model, trajectory_of
 from .slam import Slam
 
 SNAPSHOT_EVERY = 5
@@ -292,15 +291,3 @@ def _between(context: StageContext, recording: Recording, trajectory: Trajectory
         )  # fmt: skip
         poses[row[i]] = found[-1]
     return replace(trajectory, cam_from_world=poses)
-
-
-def _inputs(source: Path, config: Config) -> dict[str, float]:
-    """Constants come from settings of other stages too."""
-    return asdict(constants_of(config))
-
-
-STAGES = [
-    Stage("tracking", track, _inputs),
-    Stage("mapping", map_keyframes, _inputs),
-    Stage("global_ba", close_and_adjust, _inputs),
-]

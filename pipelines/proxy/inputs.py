@@ -1,13 +1,13 @@
 """Inputs of the stage beside the frames: the user's files and networks, checked before anything slow starts."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
 
 from ...formats.errors import InputError
 from ...formats.reading import files_sha256
 from ..config import Config
-from ..depth.files import FilesDepth, require_sizes
-from ..labels.files import FilesLabels
 from ..networks.registry import missing_networks
 from ..networks.session import card_identity
 from ..providers import Sequence
@@ -15,7 +15,6 @@ from ..source.opening import open_source
 from ..source.recording import RecordingSource
 from ..system.progress import SilentProgress, log
 from ..types import Calibration, Frame, Intrinsics
-from .reference import POSES, require_reference_in
 from .selection import (
     AUTO,
     ProviderContext,
@@ -54,6 +53,10 @@ def left_to_auto(config: Config) -> tuple[str, ...]:
 def check_proxy(source: Path, config: Config) -> None:
     """InputError for a network that is not what its card says, a map of another shape than the images, maps that
     hold nothing, and a scale reference that makes no sense."""
+    from ..depth.files import FilesDepth, require_sizes
+    from ..labels.files import FilesLabels
+    from .reference import POSES, require_reference_in
+
     if config.proxy.scale_ref.strip() == POSES and not config.frames.poses:
         raise InputError("--scale-ref poses needs poses: give them with --poses FILE|FOLDER")
     if config.proxy.scale_ref:

@@ -1,22 +1,17 @@
-"""Selection of providers by the text of the settings."""
+"""Selection of providers by the text of the settings. A provider's module is imported when it is opened."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from statistics import median
+from typing import TYPE_CHECKING
 
 from ...formats.datasets import Sequence as Recording
 from ...formats.errors import InputError, SettingError
 from ..config import ProxyConfig
-from ..depth.files import FilesDepth
-from ..depth.fused import FusedDepth
-from ..depth.learned import AlignedDepth, OnnxDepth
-from ..depth.scale import measure_scale
-from ..depth.stereo.provider import MultiviewDepth
-from ..labels.files import FilesLabels
-from ..labels.learned import OnnxClusters, OnnxLabels
-from ..labels.segments import SegmentLabels
 from ..networks.card import Card, read_card
 from ..networks.network_pass import ResultCache, Workplace
 from ..networks.registry import ModelStore, default_cache
@@ -24,7 +19,15 @@ from ..networks.words import with_words
 from ..providers import DepthProvider, SemanticsProvider, Sequence
 from ..source.opening import FolderSource
 from ..system.progress import Progress
-from .recording import RecordingDepth, RecordingLabels
+
+if TYPE_CHECKING:
+    from ..depth.files import FilesDepth
+    from ..depth.learned import OnnxDepth
+    from ..depth.stereo.provider import MultiviewDepth
+    from ..labels.files import FilesLabels
+    from ..labels.learned import OnnxLabels
+    from ..labels.segments import SegmentLabels
+    from .recording import RecordingDepth, RecordingLabels
 
 LEARNED_SPREAD = 0.02
 """Files whose depths stray by more from the triangulated points, relatively and within one frame, are taken for a
@@ -115,6 +118,8 @@ def open_depth(around: ProviderContext) -> DepthProvider:
     choice = choose_depth(around.config)
     if choice.kind in OWN_DEPTH:
         return OWN_DEPTH[choice.kind](around)
+    from ..depth.learned import AlignedDepth, OnnxDepth
+
     learned: DepthProvider = open_learned_depth(around, choice)
     if isinstance(learned, OnnxDepth) and choice.card is not None and choice.card.relative:
         learned = AlignedDepth(learned, around.sequence, choice.card.relative)
@@ -126,6 +131,8 @@ def _wants_fusion(around: ProviderContext, choice: Choice, learned: DepthProvide
     network that somebody ran before, and the points of structure from motion decide which."""
     if around.config.fuse != "learned" or choice.card is not None:
         return around.config.fuse != "never"
+    from ..depth.scale import measure_scale
+
     posed = [f for f in around.sequence.frames if f.id in around.sequence.cam_from_world]
     strays = measure_scale(around.sequence, posed[:: len(posed) // _FILES_LOOKED_AT + 1], learned.estimate).spread_in
     return bool(strays) and median(strays.values()) > LEARNED_SPREAD
@@ -135,6 +142,8 @@ def open_learned_depth(around: ProviderContext, choice: Choice) -> FilesDepth | 
     """The provider of `files` or of a network, by itself."""
     if choice.card is None:
         return open_depth_files(around, choice.folder)
+    from ..depth.learned import OnnxDepth
+
     return OnnxDepth(choice.card, _workplace(around, "network_depth"))
 
 
@@ -150,6 +159,8 @@ def open_learned_semantics(around: ProviderContext, choice: Choice) -> FilesLabe
     """The provider of `files` or of a network, by itself."""
     if choice.card is None:
         return open_label_files(around, choice.folder)
+    from ..labels.learned import OnnxClusters, OnnxLabels
+
     place = _workplace(around, "network_labels")
     if choice.card.is_clustered:
         return OnnxClusters(choice.card, place, around.config.max_classes)
@@ -158,6 +169,9 @@ def open_learned_semantics(around: ProviderContext, choice: Choice) -> FilesLabe
 
 def open_depth_files(around: ProviderContext, folder: str) -> FilesDepth | RecordingDepth:
     """The depth of a folder; without one, that of the data set itself, or files beside the source."""
+    from ..depth.files import FilesDepth
+    from .recording import RecordingDepth
+
     if not folder and around.recording is not None:
         return RecordingDepth(around.recording, around.sequence)
     turns = _turns_of(around)
@@ -166,6 +180,9 @@ def open_depth_files(around: ProviderContext, folder: str) -> FilesDepth | Recor
 
 def open_label_files(around: ProviderContext, folder: str) -> FilesLabels | RecordingLabels:
     """The labels of a folder; without one, those of the data set itself, or files beside the source."""
+    from ..labels.files import FilesLabels
+    from .recording import RecordingLabels
+
     if not folder and around.recording is not None:
         return RecordingLabels(around.recording, around.sequence, around.progress)
     turns = _turns_of(around)
@@ -201,6 +218,8 @@ def _cached(task: str, largest: bool) -> Card | None:
 
 
 def _multiview(around: ProviderContext) -> MultiviewDepth:
+    from ..depth.stereo.provider import MultiviewDepth
+
     side, planes = around.config.stereo_side, around.config.stereo_planes
     return MultiviewDepth(
         around.sequence, side, planes, lambda: around.scratch("stereo"), around.threads, around.progress, around.device
@@ -208,6 +227,8 @@ def _multiview(around: ProviderContext) -> MultiviewDepth:
 
 
 def _segments(around: ProviderContext) -> SegmentLabels:
+    from ..labels.segments import SegmentLabels
+
     return SegmentLabels(around.sequence, around.config.max_classes, around.progress)
 
 
@@ -220,6 +241,8 @@ def _fused(around: ProviderContext, learned: DepthProvider) -> DepthProvider:
     """With the multi-view depth where structure from motion has poses for it."""
     if around.sequence.backbone is None or len(around.sequence.backbone.frame_ids) < 2:
         return learned
+    from ..depth.fused import FusedDepth
+
     return FusedDepth(learned, _multiview(around), around.sequence)
 
 

@@ -9,13 +9,12 @@ from ...formats.errors import InputError
 from ..depth.files import NO_DEPTH
 from ..depth.scale import DepthScale, measure_scale
 from ..depth.stereo.provider import MultiviewDepth
-from ..engine.stages import Stage, StageContext
+from ..engine.stages import StageContext
 from ..masks.moving import find_moving
 from ..providers import dump_state
 from ..run.files import CLASSES, DESCRIPTORS, FIGURES, FRAME_SCALES, LEFT_OUT, PROXY_MAPS
 from ..system.progress import log
 from ..types import VOID, Frame
-from .inputs import check_proxy, left_to_auto, proxy_inputs
 from .reference import ReferenceScale, reference_scale, scale_figures
 from .tasks import (
     ProxyWork,
@@ -188,12 +187,3 @@ def _figures(work: ProxyWork, frames: list[Frame]) -> dict[str, Any]:
         **depths.figures(),
         **semantics.figures(),
     }
-
-
-STAGE = Stage(
-    "proxy",
-    run,
-    inputs=proxy_inputs,
-    check=check_proxy,
-    auto=left_to_auto,
-)

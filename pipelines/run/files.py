@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.atomic import write_text
-from ..depth.fields import FINE, DepthFields
 from ..geometry.sparse_model import SparseModel
 from ..types import (
     VOID,
@@ -39,6 +38,7 @@ from .schema import (
 )
 
 if TYPE_CHECKING:
+    from ..depth.fields import DepthFields
     from ..render.gaussian_map import GaussianMap
 
 Arrays = Mapping[str, NDArray]
@@ -231,17 +231,23 @@ EVERY_FRAME: RunFile[Trajectory] = replace(TRAJECTORY, name="every_frame.npz", s
 
 
 def _depth_fields(arrays: Arrays) -> DepthFields:
+    from ..depth.fields import DepthFields  # imports scipy
+
     require_increasing("frame_ids", arrays["frame_ids"])
     return DepthFields(dict(zip(arrays["frame_ids"].tolist(), arrays["log_scales"], strict=True)))
 
 
+def _log_scales(fields: DepthFields) -> Arrays:
+    from ..depth.fields import FINE
+
+    of = fields.of_frame
+    nodes = np.array(list(of.values())).reshape(-1, FINE.rows, FINE.columns)
+    return {"frame_ids": np.array(list(of), np.int64), "log_scales": nodes}
+
+
 DEPTH_FIELDS: RunFile[DepthFields] = RunFile(
     "depth_fields.npz", ("tracking", "global_ba"), "file of depth fields", _depth_fields,
-    lambda scales: {
-        "frame_ids": np.array(list(scales.of_frame), np.int64),
-        "log_scales": np.array(list(scales.of_frame.values())).reshape(-1, FINE.rows, FINE.columns),
-    },
-    {"frame_ids": "i N", "log_scales": "f N R C"},
+    _log_scales, {"frame_ids": "i N", "log_scales": "f N R C"},
 )  # fmt: skip
 """The fields that bring proxy depths into the world of a stage."""
 

@@ -123,3 +123,11 @@ def plain(figures: Any) -> Any:
     if isinstance(figures, list | tuple):
         return [plain(v) for v in figures]
     return None if isinstance(figures, float) and not math.isfinite(figures) else figures
+
+
+def keyframe_psnr(records: Mapping[str, StageRecord]) -> float | None:
+    """The PSNR of a run, dB: mean over the keyframes that made the map, each drawn with its exposure at the size that
+    the map was made at, against what it shows of the scene; as the last stage that changed the map measured it. None
+    before mapping is done."""
+    figures = (records[name].figures for name in ("global_ba", "mapping") if name in records)
+    return next((found for f in figures if (found := f.get("keyframe_psnr")) is not None), None)

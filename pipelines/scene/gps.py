@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ...formats.gps import Track, enu_from_geodetic, photo_places, read_track
+from ..config import GPS_AUTO, GPS_OFF
 from ..geometry.se3 import Similarity
 from ..outcome import Outcome
 from ..run.folder import load_source
@@ -24,7 +25,6 @@ _MIN_SPAN = 3.0
 """The path must span so many times the residual's deviation: else noise decides scale and heading."""
 
 Array = NDArray[np.float64]
-OFF, AUTO = "off", "auto"
 _MIN_GAP = 2.0
 """Seconds from a fix at which a track still gives a position; slower tracks give it within their own step."""
 
@@ -35,14 +35,14 @@ def world_on_earth(outcome: Outcome, world: World, gps: str) -> tuple[World, str
     gps: "auto" for the images' EXIF, "off", or the name of a track. The reason is "" too where nobody asked: of EXIF
     that does not suffice, only the log reports it.
     """
-    if gps == OFF:
+    if gps == GPS_OFF:
         return world, ""
-    places = _exif_places(outcome) if gps == AUTO else _track_places(outcome, _track(gps))
+    places = _exif_places(outcome) if gps == GPS_AUTO else _track_places(outcome, _track(gps))
     found = _laid_out(outcome, world, places)
     if isinstance(found, World):
         return found, ""
     log.info("not georeferenced: %s", found)
-    return world, "" if gps == AUTO else f"{gps}: not georeferenced: {found}"
+    return world, "" if gps == GPS_AUTO else f"{gps}: not georeferenced: {found}"
 
 
 def _track(gps: str) -> Track:

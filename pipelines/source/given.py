@@ -15,7 +15,6 @@ from ...formats.poses import PoseFile, read_poses, stem
 from ...formats.reading import file_sha256, files_sha256, home_expanded, reaching
 from ...formats.textfile import read_rows
 from ..config import FramesConfig
-from ..geometry import se3
 from ..types import Frame, GivenPoses
 from .opening import FolderSource, VideoSource, Warn
 from .recording import RecordingSource
@@ -39,6 +38,8 @@ def given_poses(
     """
     if not config.poses:
         return None
+    from ..geometry import se3  # imports torch
+
     file = read_poses(Path(config.poses))
     if file.names:
         found = _by_name(file, source, frames)

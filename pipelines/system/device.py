@@ -23,6 +23,12 @@ def resolve_device(wanted: str = "auto") -> str:
     return _told("cuda" if found else "cpu")
 
 
+def require_device(wanted: str) -> None:
+    """Raise InputError for a GPU that is not there."""
+    if wanted == "cuda":
+        resolve_device(wanted)
+
+
 def unused_card() -> tuple[str, str] | None:
     """An NVIDIA driver whose card torch does not find, and what to install; None where there is none, or where
     CUDA_VISIBLE_DEVICES hides it."""

@@ -10,10 +10,10 @@ changes no result of a stage keeps the users' runs; in any other state of the co
 Libraries are not part of it: another numpy or COLMAP may give other bytes, and does not make a run out of date.
 """
 
-import ast
 import functools
 import hashlib
 import os
+import re
 import tomllib
 from pathlib import Path
 
@@ -21,6 +21,8 @@ ROOT = Path(__file__).resolve().parents[2]
 TABLE = Path(__file__).with_name("stage_versions.toml")
 PACKAGE = "msgs_slam"
 """The import name of `ROOT`: of the repository in an editable install, of a folder of site-packages in any other."""
+_IMPORT = re.compile(rb"^\s*from (\.+)([\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
+"""An import inside the project: these are relative. A line of a docstring that looks like one does no harm."""
 PLUMBING = frozenset(
     [
         "msgs_slam.pipelines.config",
@@ -81,10 +83,9 @@ def _imported_files(path: Path, root: Path) -> tuple[Path, ...]:
         return ()
     package = [PACKAGE, *path.relative_to(root.resolve()).parts[:-1]]
     names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_bytes())):
-        if isinstance(node, ast.ImportFrom) and node.level:  # imports inside the project are relative
-            module = ".".join([*package[: len(package) - node.level + 1], *filter(None, [node.module])])
-            names |= {module, *(f"{module}.{alias.name}" for alias in node.names)}
+    for dots, below, imported in _IMPORT.findall(path.read_bytes()):
+        module = ".".join([*package[: len(package) - len(dots) + 1], *filter(None, [below.decode()])])
+        names |= {module, *(f"{module}.{name.decode()}" for name in re.findall(rb"\w+", imported))}
     inside = {n for n in names if n.startswith(f"{PACKAGE}.")}
     inside |= {n.rsplit(".", k)[0] for n in inside for k in range(1, n.count("."))}
     files = (file for name in sorted(inside - PLUMBING) for file in _files_of(name, root))

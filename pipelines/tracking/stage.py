@@ -3,7 +3,7 @@
 from typing import Any
 
 from ...formats.errors import InputError
-from ..engine.stages import Stage, StageContext
+from ..engine.stages import StageContext
 from ..geometry.camera import Rig, rig_of
 from ..run.files import (
     BACKBONE,
@@ -141,6 +141,3 @@ def describe(state: TrackState, frames: list[Frame], report: Report, metric: boo
         "scale_relative_sd": world.relative_sd if world else None,
         **report.figures,
     }
-
-
-STAGE = Stage("tracking", run)

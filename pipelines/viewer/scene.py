@@ -20,6 +20,7 @@ from ..export.stage import on_earth
 from ..geometry.sparse_model import SparseModel
 from ..outcome import Outcome, labels_of_channels, load_outcome, map_cloud, spread_sample
 from ..providers import class_colors
+from ..reconstruct import require_run
 from ..render.gaussian_map import decided_channels
 from ..run.files import BACKBONE, CALIBRATION, CLASSES, FRAMES
 from ..run.folder import RunFolder, load_records
@@ -133,10 +134,7 @@ def load_scenes(path: Path) -> list[ViewerScene]:
         return [_from_file(path)]
     if not is_folder:
         raise InputError(f"{path}: there is no such run folder or splat file")
-    if not (run := RunFolder(path)).manifest_file.exists():
-        raise InputError(
-            f"{path} is no run folder: it has no manifest.json. Give the folder of `msgs-slam reconstruct`"
-        )
+    require_run(run := RunFolder(path))
     records = load_records(run)
     if "mapping" not in records:
         return [_from_tracking(load_outcome(run)) if "tracking" in records else _from_frames(run, "frames" in records)]

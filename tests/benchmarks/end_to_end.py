@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from msgs_slam.pipelines.outcome import keyframe_psnr
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.manifest import keyframe_psnr
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 

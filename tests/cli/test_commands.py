@@ -2,12 +2,15 @@
 
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import click
 import numpy as np
 import pytest
+from cli_runs import FinishedRun
 from click.testing import CliRunner, Result
 
 from msgs_slam.formats.atomic import temporary_of
@@ -268,3 +271,44 @@ def test_a_class_map_that_is_none_is_refused_before_the_run_is_looked_at(tmp_pat
     result = invoke("evaluate", tmp_path / "no.msgs", "--truth", tmp_path, "--class-map", "mine.toml")
     assert result.exit_code == 1
     assert "mine.toml: there is no such file, nor a class map of that name; known: ade20k-replica" in result.stderr
+
+
+LOADED_BY_EACH = """
+import sys
+from click.testing import CliRunner
+from msgs_slam.msgs_cli.main import main
+
+heavy = ("torch", "numba", "scipy", "skimage", "onnxruntime")
+for line in sys.stdin.read().splitlines():
+    result = CliRunner().invoke(main, line.split("\t"))
+    loaded = ",".join(name for name in heavy if name in sys.modules)
+    print(result.exit_code, loaded or "nothing", line, sep="|")
+"""
+
+
+def test_what_computes_nothing_loads_nothing_that_computes(finished_run: FinishedRun, tmp_path: Path) -> None:
+    """Importing torch, numba and scipy takes seconds: who looks at a run, or has mistyped, does not wait for them."""
+    run, no_run, none = finished_run.folder, tmp_path, tmp_path / "none.mp4"
+    (torn := tmp_path / "torn.mp4").write_bytes(bytes(range(256)) * 8)
+    fine = (
+        ("status", run), ("status", run, "--json"), ("resume", run, "-q"), ("config",), ("models", "list"),
+        ("reconstruct", finished_run.video, "--out", run, "-q"),
+    )  # fmt: skip
+    refused = (
+        ("status", no_run), ("resume", no_run), ("export", no_run), ("report", no_run), ("view", no_run),
+        ("render", no_run, "x.mp4"), ("evaluate", no_run, "--truth", no_run), ("extend", no_run, torn),
+        ("batch", no_run / "nowhere", "--out", no_run), ("reconstruct", none), ("reconstruct", torn),
+        ("reconstruct", no_run), ("reconstruct", finished_run.video, "--semantics", "tags", "--out", no_run / "a"),
+        ("reconstruct", finished_run.video, "--set", "frames.rate=-1"), ("demo", "--set", "frames.rate=-1"),
+        ("models", "check", "nothing"),
+    )  # fmt: skip
+    lines = ["\t".join(map(str, words)) for words in (*fine, *refused)]
+    done = subprocess.run(
+        [sys.executable, "-c", LOADED_BY_EACH], input="\n".join(lines), capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    codes, loaded, _ = zip(*(row.split("|", 2) for row in done.stdout.splitlines()), strict=True)
+    assert len(codes) == len(lines)
+    assert set(codes[: len(fine)]) == {"0"}
+    assert set(codes[len(fine) :]) <= {"1", "2"}
+    assert set(loaded) == {"nothing"}, done.stdout

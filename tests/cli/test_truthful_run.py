@@ -15,10 +15,10 @@ from cli_runs import OPTIONS, FinishedRun, invoke
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.outcome import keyframe_psnr
 from msgs_slam.pipelines.reconstruct import made_with, reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
 from msgs_slam.pipelines.run.lock import locked
+from msgs_slam.pipelines.run.manifest import keyframe_psnr
 from msgs_slam.pipelines.source.opening import source_digest
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.system.wording import figure_text

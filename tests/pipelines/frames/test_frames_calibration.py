@@ -13,7 +13,8 @@ from msgs_slam.formats.datasets.sequence import Camera
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config, FramesConfig
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.frames.stage import STAGE, run
+from msgs_slam.pipelines.frames.inputs import frames_inputs
+from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.sfm.lens import distortion_of, make_lens, set_lens, to_pycolmap, unknown_camera
 from msgs_slam.pipelines.source.given import read_intrinsics
 from msgs_slam.pipelines.source.opening import FolderSource
@@ -170,13 +171,13 @@ def test_a_calibration_file_that_has_changed_makes_the_stage_again(tmp_path: Pat
 
     def inputs(text: str) -> dict[str, str] | None:
         path.write_text(text)
-        return STAGE.inputs(bent_walk.folder, asked)
+        return frames_inputs(bent_walk.folder, asked)
 
     before = inputs("500 500 320 240")
     assert before is not None
     assert inputs("510 510 320 240") != before == inputs("500 500 320 240")
     numbers = Config(frames=FramesConfig(intrinsics="500,500,320,240", people="off"))
-    assert STAGE.inputs(bent_walk.folder, numbers) is None
+    assert frames_inputs(bent_walk.folder, numbers) is None
 
 
 @pytest.mark.parametrize("suffix", [".txt", ".bin"])

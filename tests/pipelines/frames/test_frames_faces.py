@@ -15,7 +15,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.video_streams import PART, WHOLE, image_sphere, video_sphere
 from msgs_slam.pipelines.config import FramesConfig
-from msgs_slam.pipelines.frames.stage import check
+from msgs_slam.pipelines.frames.inputs import check_frames
 from msgs_slam.pipelines.geometry.camera import CUBE, ONE_CAMERA, Rig, rig_of
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.source.faces import find_faces, fisheye_face, looks_like_panoramas, panorama_faces
@@ -136,8 +136,8 @@ def test_what_cannot_be_is_refused_before_the_work(tmp_path: Path) -> None:
         find_faces(source, FramesConfig(camera="fisheye"))
     for text in ("proxy.depth=files", "proxy.scale_ref=1.jpg:1,1,2,2=1"):
         with pytest.raises(InputError, match="cannot be used with panoramas"):
-            check(source.path, load_config(None, ["frames.camera=equirectangular", text]))
-    check(source.path, load_config(None, ["frames.camera=equirectangular", "proxy.scale_ref=height=1.5"]))
+            check_frames(source.path, load_config(None, ["frames.camera=equirectangular", text]))
+    check_frames(source.path, load_config(None, ["frames.camera=equirectangular", "proxy.scale_ref=height=1.5"]))
 
 
 @pytest.mark.parametrize(("said", "kind"), [("equirectangular", WHOLE), ("cubemap", PART), ("", "")])

@@ -17,6 +17,7 @@ from onnx import TensorProto, helper, numpy_helper
 import msgs_slam.pipelines.frames.learned as learned
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import FramesConfig
+from msgs_slam.pipelines.frames.inputs import check_frames
 from msgs_slam.pipelines.frames.learned import (
     EXTRACTOR,
     MATCHER,
@@ -24,7 +25,6 @@ from msgs_slam.pipelines.frames.learned import (
     learned_inputs,
     open_learned,
 )
-from msgs_slam.pipelines.frames.stage import check
 from msgs_slam.pipelines.geometry.camera import project, unproject
 from msgs_slam.pipelines.masks.people import people_cards
 from msgs_slam.pipelines.networks.registry import ModelStore
@@ -198,5 +198,5 @@ def test_without_the_networks_the_stage_says_what_to_type(tmp_path: Path, monkey
         cv2.imwrite(str(tmp_path / f"{i}.png"), picture(i))
     assert learned_inputs(FramesConfig()) == {}
     with pytest.raises(InputError, match=r"49 MB.*run: msgs-slam models pull aliked-n16rot"):
-        check(tmp_path, load_config(overrides=["frames.features=aliked"]))
-    check(tmp_path, load_config())
+        check_frames(tmp_path, load_config(overrides=["frames.features=aliked"]))
+    check_frames(tmp_path, load_config())

@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.frames.stage import STAGE
+from msgs_slam.pipelines.frames.inputs import frames_division
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
@@ -234,6 +234,5 @@ def test_memory_makes_only_frames_of_long_recordings_again(keyframes: int, diffe
     files = checksums(run.stage("frames"))
     record = StageRecord("", files, 0, 0, {"keyframes": keyframes}, [], "")
     write_manifest(run.manifest_file, Manifest(Source("", ""), {"frames": record}))
-    assert STAGE.division is not None
-    whole, parts = (STAGE.division(run, load_config(None, [f"run.memory_mb={mb}"])) for mb in (0, 1100))
+    whole, parts = (frames_division(run, load_config(None, [f"run.memory_mb={mb}"])) for mb in (0, 1100))
     assert (whole != parts) == differs

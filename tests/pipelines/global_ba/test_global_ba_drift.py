@@ -17,7 +17,7 @@ from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.global_ba.stage import STAGE
+from msgs_slam.pipelines.global_ba.stage import run as run_global_ba
 from msgs_slam.pipelines.mapping.views import occurring_classes
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import (
@@ -113,7 +113,7 @@ def close(
         made = make_run(tmp_path / joint, keyframes=tuple(range(0, 24, 2)), backbone_scale=1.0, metric=False)
         finish_mapping(made, room_frames[1])
         context = open_stage(made.run, "global_ba", load_config(overrides=[*SETTINGS, f"global_ba.joint={joint}"]))
-        figures = STAGE.run(context)
+        figures = run_global_ba(context)
         shutil.rmtree(context.folder / "snapshot", ignore_errors=True)
         context.folder.rename(made.run.stage("global_ba"))
         return made.run, figures

@@ -18,7 +18,7 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import unproject
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.global_ba.stage import STAGE
+from msgs_slam.pipelines.global_ba.stage import run as run_global_ba
 from msgs_slam.pipelines.mapping.views import occurring_classes
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
@@ -131,7 +131,7 @@ def mapped(
 
 
 def finish(context: StageContext) -> dict:
-    figures = STAGE.run(context)
+    figures = run_global_ba(context)
     shutil.rmtree(context.folder / "snapshot", ignore_errors=True)
     context.folder.rename(context.run.stage("global_ba"))
     return figures
@@ -188,7 +188,7 @@ def test_joint_refinement_is_kept_only_where_it_helps_and_survives_interruption(
     context = open_stage(broken.run, "global_ba", config)
     keyframes = int(broken.run.load(TRAJECTORY, "mapping").is_keyframe.sum())  # a snapshot comes once a pass at most
     with pytest.raises(KeyboardInterrupt):
-        STAGE.run(
+        run_global_ba(
             StageContext(context.run, context.source, config, context.folder, BreakOff("refining", keyframes + 3))
         )
     assert (context.snapshot / "loops.npz").exists()

@@ -13,7 +13,8 @@ from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import resize_depth
 from msgs_slam.pipelines.mapping import extending
-from msgs_slam.pipelines.mapping.load import MappingInput, load_views, split_frames
+from msgs_slam.pipelines.mapping.division import split_frames
+from msgs_slam.pipelines.mapping.load import MappingInput, load_views
 from msgs_slam.pipelines.mapping.move_map import interpolate_rows, move_trajectory
 from msgs_slam.pipelines.mapping.schedule import RATE_DECAY, Schedule, Seeding, keyframe_weights
 from msgs_slam.pipelines.mapping.views import channel_table, halved, occurring_classes

@@ -16,9 +16,7 @@ from msgs_slam.pipelines.config import Config, ProxyConfig, RunConfig, with_meth
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.paper import stages
-from msgs_slam.pipelines.paper.constants import PAPER
-from msgs_slam.pipelines.paper.recording import constants_of
-from msgs_slam.pipelines.paper.stages import STAGES
+from msgs_slam.pipelines.paper.constants import PAPER, constants_of
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.run.files import CLASS_IDS, DEPTH_FIELDS, MAP, SPARSE, TRAJECTORY
@@ -27,6 +25,7 @@ from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.pipelines.mapping.small_run import make_run
 
 CONFIG = Config(run=RunConfig(method="paper", threads=1))
+STAGES = all_stages("paper")[2:5]
 FRAMES = 8
 
 

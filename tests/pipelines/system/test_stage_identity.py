@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from msgs_slam.pipelines.config import STAGES
+from msgs_slam.pipelines.engine.stages import Later
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.system.identity import ROOT, TABLE, source_digest, stage_identity, stage_sources
 
@@ -72,3 +73,10 @@ def test_identity_is_a_number_only_where_the_sources_are_the_released_ones(
 def test_every_stage_lies_where_the_release_looks_for_it() -> None:
     for stage in all_stages():
         assert stage.file.resolve() == ROOT / "pipelines" / stage.name / "stage.py"
+
+
+@pytest.mark.parametrize("method", ["default", "paper"])
+def test_every_stage_names_a_function_that_there_is(method: str) -> None:
+    for stage in all_stages(method):
+        assert isinstance(stage.run, Later)
+        assert callable(stage.run.function)

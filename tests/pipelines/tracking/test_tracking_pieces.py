@@ -9,7 +9,7 @@ from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import BACKBONE, SPARSE, TRAJECTORY
-from msgs_slam.pipelines.tracking.stage import STAGE
+from msgs_slam.pipelines.tracking.stage import run as run_tracking
 from tests.pipelines.tracking.conftest import MadeRun
 
 OTHERS = (15, 18, 21, 23)
@@ -18,7 +18,7 @@ OTHERS = (15, 18, 21, 23)
 
 def track(made: MadeRun, open_stage: Callable[..., StageContext], least: int) -> tuple[dict, list[str]]:
     context = open_stage(made.run, "tracking", load_config(overrides=[f"frames.least_piece={least}"]))
-    figures = STAGE.run(context)
+    figures = run_tracking(context)
     context.folder.rename(made.run.stage("tracking"))
     return figures, context.warnings
 

@@ -19,7 +19,8 @@ from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, DEPTH_FIELDS, FRAMES, GIVEN_POSES, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.sfm.retrieval import describe
 from msgs_slam.pipelines.tracking import adjust, pictures, stage
-from msgs_slam.pipelines.tracking.stage import STAGE, stretches
+from msgs_slam.pipelines.tracking.stage import run as run_tracking
+from msgs_slam.pipelines.tracking.stage import stretches
 from msgs_slam.pipelines.tracking.state import TrackState
 from msgs_slam.pipelines.types import GivenPoses
 from tests.pipelines.tracking.conftest import MadeRun
@@ -27,7 +28,7 @@ from tests.pipelines.tracking.conftest import MadeRun
 
 def finish(context: StageContext) -> dict:
     """Run the stage and put its folder in place, as the runner does."""
-    figures = STAGE.run(context)
+    figures = run_tracking(context)
     shutil.rmtree(context.folder / "snapshot", ignore_errors=True)
     context.folder.rename(context.run.stage("tracking"))
     return figures
@@ -65,7 +66,7 @@ def test_given_poses_of_which_no_frame_could_be_posed_are_no_motion(
     GIVEN_POSES.save(made.run.stage("frames"), GivenPoses(np.full((24, 4, 4), np.nan), True, "made up"))
     monkeypatch.setattr(stage, "track_frames", lambda *_: TrackState())
     with pytest.raises(InputError, match="no camera motion could be recovered from 24 frames"):
-        STAGE.run(open_stage(made.run, "tracking"))
+        run_tracking(open_stage(made.run, "tracking"))
 
 
 @pytest.mark.parametrize(("memory", "described"), [(1e9, 2), (0.0, 4)])
@@ -157,7 +158,7 @@ def test_interrupted_work_ends_with_the_same_bytes(
     whole, broken = make_run(tmp_path / "a"), make_run(tmp_path / "b")
     finish(open_stage(whole.run, "tracking"))
     with pytest.raises(KeyboardInterrupt):
-        STAGE.run(interrupted(open_stage(broken.run, "tracking"), after=13))
+        run_tracking(interrupted(open_stage(broken.run, "tracking"), after=13))
     assert (broken.run.partial("tracking") / "snapshot" / "state.npz").exists()
     finish(open_stage(broken.run, "tracking"))
     for name in ("trajectory.npz", "sparse.npz", "depth_fields.npz", "tracking.json"):
@@ -253,7 +254,7 @@ def test_nothing_to_go_by_is_refused(
 ) -> None:
     made = make_run(tmp_path / "run", keyframes=())
     with pytest.raises(InputError, match="Possible causes: a camera that stands still or only turns"):
-        STAGE.run(open_stage(made.run, "tracking", Config()))
+        run_tracking(open_stage(made.run, "tracking", Config()))
 
 
 def test_stretches() -> None:

@@ -13,7 +13,7 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.tracking.front_end import fit_rotation, turn_between
 from msgs_slam.pipelines.tracking.pictures import Pictures
-from msgs_slam.pipelines.tracking.stage import STAGE
+from msgs_slam.pipelines.tracking.stage import run as run_tracking
 from msgs_slam.pipelines.types import Intrinsics, Trajectory
 from tests.pipelines.tracking.conftest import MadeRun
 from tests.world.clip import ClipOptions, WorldFrame, develop, make_world, render_view
@@ -58,7 +58,7 @@ def test_a_turn_away_keeps_its_frames_and_says_so(
     angles = np.arange(12, 97, 12)
     made = make_run(tmp_path / "run", more=seen_from([turned_by(last_pose, a) for a in angles]))
     context = open_stage(made.run, "tracking")
-    figures = STAGE.run(context)
+    figures = run_tracking(context)
     context.folder.rename(made.run.stage("tracking"))
 
     found = made.run.load(TRAJECTORY, "tracking")

@@ -1,0 +1,77 @@
+"""Inputs of the stage beside the source, what of them is refused, and into which windows memory divides it.
+
+Imports nothing that computes.
+"""
+
+from pathlib import Path
+
+from ...formats.errors import InputError
+from ...formats.image_folder import hint_at_inner_folder
+from ..config import Config
+from ..run.extension import parent_inputs
+from ..run.files import CALIBRATION
+from ..run.folder import RunFolder, load_records
+from ..source.given import check_poses, intrinsics_inputs, pose_inputs, read_intrinsics
+from ..source.opening import FolderSource, Source, Warn, open_source
+from ..system.memory import window_size, windows_of
+from .learned import learned_inputs, open_learned
+from .masks import check_masks, mask_inputs
+
+
+def frames_inputs(source: Path, config: Config) -> dict[str, str] | None:
+    """Return digests of the user's masks, poses and camera and of the networks, and what an extended run was."""
+    settings = config.frames
+    given = pose_inputs(settings) | intrinsics_inputs(settings.intrinsics)
+    return (mask_inputs(source, config) or {}) | learned_inputs(settings) | given | parent_inputs(source) or None
+
+
+def frames_division(run: RunFolder, config: Config) -> list[range]:
+    """Return the windows of structure from motion, which are smaller for less memory: other ones give other poses."""
+    calibration, figures = run.load(CALIBRATION), load_records(run)["frames"].figures
+    pixels = calibration.intrinsics.width * calibration.intrinsics.height
+    size = window_size(config.run.memory_mb, pixels)
+    return windows_of(figures.get("keyframes", 0), size) if calibration.directions == 1 else []
+
+
+def check_frames(source: Path, config: Config) -> None:
+    """Raise InputError for a source, or a camera given for it, that cannot be used."""
+    opened = open_source(source, config.run.format)
+    require_several(opened)
+    from ..sfm.rolling import read_readout  # pycolmap, for sources that can be used
+    from ..source.faces import find_faces
+
+    check_masks(source, config)
+    open_learned(config.frames)
+    read_readout(config.frames.rolling_shutter)
+    faces = find_faces(opened, config.frames)
+    if faces is None and config.frames.intrinsics:
+        read_intrinsics(config.frames.intrinsics, opened.width, opened.height)
+    if faces is not None and len(faces) > 1:
+        _check_panoramas(config)
+    check_poses(config.frames, opened)
+
+
+def _check_panoramas(config: Config) -> None:
+    """What knows pixels of the source's own pictures does not know its panoramas."""
+    if config.frames.poses:
+        raise InputError("--poses cannot be used with panoramas, which are cut into several images first: omit it")
+    files = [p for p in (config.proxy.depth, config.proxy.semantics) if p.startswith("files")]
+    reference = config.proxy.scale_ref.strip()
+    if files or (reference and not reference.startswith("height")):
+        what = f"{files[0]!r}" if files else f"--scale-ref {reference}"
+        raise InputError(
+            f"{what} cannot be used with panoramas, which are cut into several images first: omit it. For metres, give "
+            "--scale-ref height=METRES, the height of the camera above the floor"
+        )
+
+
+def require_several(source: Source, warn: Warn | None = None) -> None:
+    """Raise InputError for a folder of one image; warn where images of a folder inside may be meant."""
+    if not isinstance(source, FolderSource):
+        return
+    hint = hint_at_inner_folder(source.path, source.expected_frames + 1)
+    if len(source.headers.of) < 2:
+        needed = f"holds one image only; a reconstruction needs several views of a scene{hint and ': '}{hint}"
+        raise InputError(f"{source.path} {needed}")
+    if hint and warn is not None:
+        warn(f"{source.path} holds {source.expected_frames} images; {hint} if those are meant")
