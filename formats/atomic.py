@@ -33,12 +33,12 @@ def after_each_write(call: Callable[[Path], None]) -> Iterator[None]:
         _after_write.remove(call)
 
 
-def process_mark() -> str:
+def process_token() -> str:
     """Return a mark of this process, unique among the processes that share a disk, on this machine or another."""
-    return f"{machine_mark()}-{os.getpid()}"
+    return f"{machine_token()}-{os.getpid()}"
 
 
-def machine_mark() -> str:
+def machine_token() -> str:
     """Return a mark of this machine, or of the container where it has process ids of its own."""
     counted = ""
     with suppress(OSError):
@@ -47,10 +47,10 @@ def machine_mark() -> str:
 
 
 @contextmanager
-def own_temporaries() -> Iterator[None]:
+def unique_temp_names() -> Iterator[None]:
     """Give temporary files inside this block names that no other process uses, on this machine or another: several may
     write the same file at the same time, and the last rename wins. Files of a killed process remain."""
-    _own_mark.append(f"-{process_mark()}")
+    _own_mark.append(f"-{process_token()}")
     try:
         yield
     finally:
@@ -63,7 +63,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
     The folder is made when missing. A block that raises leaves `path` as it was and no temporary file behind. The
     temporary name depends on `path` alone, so what a killed process left is overwritten by the next attempt; but in
-    `own_temporaries`.
+    `unique_temp_names`.
 
     Raises DiskFullError when the disk is full, InputError when the folder cannot be written.
     """

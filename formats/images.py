@@ -408,3 +408,8 @@ def _transformed(image: Image.Image, source: object, target: object) -> Image.Im
     if made is None:
         raise ValueError(f"its colours ({image.mode}) cannot be converted")
     return made
+
+
+def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Convert (H, W, 3) RGB to (H, W) grey."""
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)

@@ -88,7 +88,7 @@ def batch(
     if failed:
         say(f"{len(failed)} of {len(mine)} recordings failed; {out}/NAME.failed.txt says why", err=True)
     runs = {"runs": [r.run for r in mine], "failed": [r.run for r in failed]}
-    output.tell_result(int(bool(failed)), table=out / "batch.json", **runs)
+    output.report_result(int(bool(failed)), table=out / "batch.json", **runs)
     if failed:
         sys.exit(1)
 
@@ -159,4 +159,4 @@ def work(run_path: Path, shard: str, placed: bool, until: str, output: Output) -
     hint = f"The same command goes on, or without others: msgs-slam resume {quoted(run.root)}"
     with output.stopping_softly("" if placed else hint):
         work_on_run(run, chosen, load_settings(run), output.task_progress, until, placed)
-    output.tell_result(run=run.root)
+    output.report_result(run=run.root)

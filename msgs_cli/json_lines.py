@@ -25,7 +25,7 @@ T = TypeVar("T")
 _SECONDS_BETWEEN = 0.2
 _STDERR = 2
 _AT_ONCE = 1 << 16
-_place: list[int] = []
+_target_fd: list[int] = []
 """Where the lines go while the standard error output is watched; empty: to sys.stderr."""
 _stage: dict[str, Any] = {}
 """The stage that runs."""
@@ -38,13 +38,13 @@ def write_line(event: str, **values: Any) -> None:
 
 def _write(line: str) -> None:
     line += "\n"
-    if not _place:
+    if not _target_fd:
         sys.stderr.write(line)
         sys.stderr.flush()
         return
     rest = line.encode("ascii")
     while rest:
-        rest = rest[os.write(_place[-1], rest) :]
+        rest = rest[os.write(_target_fd[-1], rest) :]
 
 
 class Interrupted(click.ClickException):
@@ -63,15 +63,15 @@ class JsonProgress:
     def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
         """Yield the items, and write a progress line every so often."""
         done, said = 0, 0.0
-        self._tell(label, 0, total)
+        self._report(label, 0, total)
         for done, item in enumerate(items, 1):
             yield item
             if time.monotonic() - said > _SECONDS_BETWEEN:
                 said = time.monotonic()
-                self._tell(label, done, total)
-        self._tell(label, done, total, ended=True)
+                self._report(label, done, total)
+        self._report(label, done, total, ended=True)
 
-    def _tell(self, label: str, done: int, total: int | None, **more: Any) -> None:
+    def _report(self, label: str, done: int, total: int | None, **more: Any) -> None:
         write_line("progress", **self._job, **_stage, label=label, done=done, total=total, **more)
 
     def stage(self, event: StageEvent) -> None:
@@ -106,11 +106,11 @@ def is_asked_for(arguments: Iterable[str]) -> bool:
 
 
 @contextmanager
-def only_json() -> Iterator[None]:
+def json_stderr() -> Iterator[None]:
     """Write everything on stderr as JSON lines inside this block: prints of libraries, other threads and child
     processes become {"event": "log", "level": "print"}, the outcome the last line. Always ends with SystemExit."""
     code = 0
-    with _watched():
+    with _captured_stderr():
         try:
             yield
         except click.exceptions.Exit as ended:
@@ -134,7 +134,7 @@ def _trace(error: BaseException) -> str:
 
 
 @contextmanager
-def _watched() -> Iterator[None]:
+def _captured_stderr() -> Iterator[None]:
     """Turn what is printed on the process's stderr into lines; nothing where sys.stderr is something else (a test)."""
     try:
         real = sys.stderr.fileno() == _STDERR
@@ -149,8 +149,8 @@ def _watched() -> Iterator[None]:
     os.close(writing)
     # What was a file can be sought in, and a pipe cannot: the old stream would try.
     sys.stderr = open(_STDERR, "w", buffering=1, encoding="utf-8", errors="backslashreplace", closefd=False)  # noqa: SIM115
-    _place.append(kept)
-    reader = threading.Thread(target=_tell_prints, args=(reading,), daemon=True)
+    _target_fd.append(kept)
+    reader = threading.Thread(target=_report_prints, args=(reading,), daemon=True)
     reader.start()
     try:
         yield
@@ -164,18 +164,18 @@ def _watched() -> Iterator[None]:
         reader.join(timeout=2.0)  # a child that still runs holds the other end
 
 
-def _tell_prints(source: int) -> None:
+def _report_prints(source: int) -> None:
     """A line for each line that comes; carriage returns end lines too."""
     rest = b""
     while data := os.read(source, _AT_ONCE):
         *lines, rest = (rest + data).replace(b"\r", b"\n").split(b"\n")
         for line in filter(None, lines):
-            _tell_print(line)
+            _report_print(line)
     if rest:
-        _tell_print(rest)
+        _report_print(rest)
 
 
-def _tell_print(line: bytes) -> None:
+def _report_print(line: bytes) -> None:
     text = line.decode("utf-8", errors="backslashreplace")
     with suppress(OSError):
         if _is_event(text):

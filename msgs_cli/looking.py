@@ -66,7 +66,7 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | No
     with on_sigterm(signal.SIG_DFL):
         figures = write_evaluation(run, sequence, output.progress(), class_map=joins)
     say(evaluation_table(figures, with_protocol=False))
-    output.tell_result(evaluation=run.evaluation_file.parent)
+    output.report_result(evaluation=run.evaluation_file.parent)
 
 
 @click.command()
@@ -90,7 +90,7 @@ def report(run_path: Path, to: Path | None, pdf: bool, output: Output) -> None:
             print_pdf(made[0], made[1], browser)
     for path in made:
         say(path)
-    output.tell_result(report=made[0], **dict(zip(["pdf"], made[1:], strict=False)))
+    output.report_result(report=made[0], **dict(zip(["pdf"], made[1:], strict=False)))
 
 
 SPLAT_FILES = (".ply", ".spz", ".glb", ".splat", ".safetensors")
@@ -146,11 +146,11 @@ def render(
 
     with on_sigterm(signal.SIG_DFL):
         if run is None:
-            made = render_file(source, target, fps, output.progress(), size, camera_path, output.tell)
+            made = render_file(source, target, fps, output.progress(), size, camera_path, output.report)
         else:
-            made = render_run(run, target, kind, camera_path, fps, output.progress(), size, output.tell)
+            made = render_run(run, target, kind, camera_path, fps, output.progress(), size, output.report)
     say(made)
-    output.tell_result(video=made)
+    output.report_result(video=made)
 
 
 @click.command()

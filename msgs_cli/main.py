@@ -18,7 +18,7 @@ from ..pipelines.config import EXPORTS, STAGES
 from ..pipelines.system.wording import quoted
 from . import looking
 from .batch import batch, work
-from .json_lines import Interrupted, is_asked_for, only_json
+from .json_lines import Interrupted, is_asked_for, json_stderr
 from .models import doctor, models
 from .options import (
     FOLDER,
@@ -42,8 +42,8 @@ from .output import (
     print_summary,
     printable,
     program,
+    report_run,
     say,
-    tell_run,
     verbosity_options,
 )
 
@@ -57,7 +57,7 @@ class FriendlyGroup(click.Group):
         words = sys.argv[1:] if args is None else list(args)
         if not is_asked_for(words):
             return super().main(args, *rest, **more)
-        with only_json():
+        with json_stderr():
             sys.exit(super().main(args, *rest, **more | {"standalone_mode": False}))
 
     def resolve_command(
@@ -190,7 +190,7 @@ def reconstruct(
         output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"),
     ):
         records = run_reconstruct(one_source(sources, run), run, config, output.progress(), until, workers)
-    tell_run(output, run.root, records)
+    report_run(output, run.root, records)
 
 
 @main.command()
@@ -232,7 +232,7 @@ def resume(
         output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"),
     ):
         records = run_resume(run, output.progress(), config, until, workers, redo=redo or "")
-    tell_run(output, run.root, records)
+    report_run(output, run.root, records)
 
 
 @main.command()
@@ -275,7 +275,7 @@ def export(
     for path in written:
         if not output.quiet:
             say(path)
-    output.tell_result(export=folder, files=written)
+    output.report_result(export=folder, files=written)
 
 
 @main.command()
@@ -318,7 +318,7 @@ def demo(
     say(f"\nNext:\n  {program()} view {quoted(root)}      # the map in your browser")
     say(f"  {program()} report {quoted(root)}    # one HTML page: what was found, and how good it is")
     say(f"  {program()} reconstruct video.mp4 # your own video, or a folder of images")
-    output.tell_result(run=root, export=root / "export", evaluation=root / "evaluation")
+    output.report_result(run=root, export=root / "export", evaluation=root / "evaluation")
 
 
 @main.command()
@@ -370,4 +370,4 @@ def extend(run_path: Path, videos: tuple[Path, ...], output: Output) -> None:
     run = RunFolder(run_path)
     with output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"):
         records = extend_run(run, videos, output.progress())
-    tell_run(output, run.root, records)
+    report_run(output, run.root, records)

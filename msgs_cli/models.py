@@ -156,7 +156,7 @@ def check(names: tuple[str, ...]) -> None:
     found = {name: check_network(card, view) for name, card in cards.items()}
     for name, findings in found.items():
         say(f"{name}: {cards[name].model}")
-        _tell(findings)
+        _print_findings(findings)
     if any(f.state == BAD for findings in found.values() for f in findings):
         sys.exit(1)
 
@@ -184,12 +184,12 @@ def doctor() -> None:
     from ..pipelines.doctor import examine
 
     findings = examine(Path("."))
-    _tell(findings)
+    _print_findings(findings)
     if any(f.state == BAD for f in findings):
         sys.exit(1)
 
 
-def _tell(findings: Sequence[Finding]) -> None:
+def _print_findings(findings: Sequence[Finding]) -> None:
     """A line for each finding, another for what to do."""
     width = max(len(f.name) for f in findings)
     for f in findings:

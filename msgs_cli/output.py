@@ -57,7 +57,7 @@ _WIDTH = 32
 _STOPPING = (
     "Stopping at the next snapshot. Press Ctrl-C again to stop now (what was done since the last snapshot is lost)."
 )
-_said: set[str] = set()
+_shown: set[str] = set()
 """The warnings shown since logging was set up."""
 
 
@@ -92,7 +92,7 @@ class Output:
         """Send logs to stderr: warnings, or everything, or errors only."""
         level = logging.ERROR if self.quiet else logging.INFO if self.verbose else logging.WARNING
         handler: logging.Handler = JsonHandler() if self.as_json else TextHandler()
-        handler.addFilter(SaidOnce())
+        handler.addFilter(DuplicateFilter())
         logging.basicConfig(level=level, handlers=[handler], force=True)
 
     def progress(self, job: str = "") -> Progress:
@@ -117,14 +117,14 @@ class Output:
         log.info("%s: begins", name)
         return self.progress(name)
 
-    def tell(self, text: str) -> None:
+    def report(self, text: str) -> None:
         """Print a line on stderr, or log it as JSON, for people who wait."""
         if self.as_json and not self.quiet:
             write_line("log", level="info", message=text)
         elif not self.quiet:
             say(text, err=True)
 
-    def tell_result(self, exit_code: int = 0, /, **paths: Path | list[Path]) -> None:
+    def report_result(self, exit_code: int = 0, /, **paths: Path | list[Path]) -> None:
         """Write the last event of a command that came to its end, for programs: where its results are."""
         if self.as_json and not self.quiet:
             texts = {k: [str(p) for p in v] if isinstance(v, list) else str(v) for k, v in paths.items()}
@@ -136,7 +136,7 @@ class Output:
         second; then the process ends with 128 plus the signal's number, as shells expect. Says `how_to_go_on`, and
         nothing where that is empty: the process that started this one does."""
         try:
-            with soft_stop(self._tell_stopping if how_to_go_on else lambda number: None):
+            with soft_stop(self._report_stopping if how_to_go_on else lambda number: None):
                 yield
         except KeyboardInterrupt as error:
             number = getattr(error, "number", signal.SIGINT)
@@ -146,32 +146,32 @@ class Output:
                 say(f"\nStopped. {how_to_go_on}", err=True)
             sys.exit(128 + number)
 
-    def _tell_stopping(self, number: int) -> None:
+    def _report_stopping(self, number: int) -> None:
         if self.as_json:
             write_line("stopping", signal=number, message=_STOPPING)
         else:  # not through click: a signal may come while it prints
             os.write(2, f"\n{_STOPPING}\n".encode())
 
 
-class SaidOnce(logging.Filter):
+class DuplicateFilter(logging.Filter):
     """Shows a warning once, however often it comes."""
 
     def __init__(self) -> None:
         super().__init__()
-        _said.clear()
+        _shown.clear()
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Whether it is news."""
         text = record.getMessage()
-        is_news = record.levelno != logging.WARNING or text not in _said
+        is_news = record.levelno != logging.WARNING or text not in _shown
         if record.levelno == logging.WARNING:
-            _said.add(text)
+            _shown.add(text)
         return is_news
 
 
-def is_said(warning: str) -> bool:
+def was_shown(warning: str) -> bool:
     """Whether it has been shown already."""
-    return warning in _said
+    return warning in _shown
 
 
 @contextmanager
@@ -322,16 +322,18 @@ def scale_lines(root: Path, records: dict[str, StageRecord]) -> list[str]:
     return [] if metres is None else [f"\nScale: {metres.text}"]
 
 
-def warning_lines(records: dict[str, StageRecord], is_said: Callable[[str], bool] = lambda text: False) -> list[str]:
+def warning_lines(records: dict[str, StageRecord], was_shown: Callable[[str], bool] = lambda text: False) -> list[str]:
     """Every degraded result, by stage, that is not said yet."""
-    return [f"warning ({n}): {text}" for n, record in records.items() for text in record.warnings if not is_said(text)]
+    return [
+        f"warning ({n}): {text}" for n, record in records.items() for text in record.warnings if not was_shown(text)
+    ]
 
 
-def tell_run(output: Output, root: Path, records: dict[str, Any]) -> None:
+def report_run(output: Output, root: Path, records: dict[str, Any]) -> None:
     """Say how the run is now, for people unless they want errors only, and for programs."""
     if not output.quiet:
         print_summary(root, records)
-    output.tell_result(run=root, **({"export": root / "export"} if "export" in records else {}))
+    output.report_result(run=root, **({"export": root / "export"} if "export" in records else {}))
 
 
 def print_summary(root: Path, records: dict[str, Any]) -> None:
@@ -341,7 +343,7 @@ def print_summary(root: Path, records: dict[str, Any]) -> None:
     from ..pipelines.status import DONE, StageStatus, about_new_networks
 
     say(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
-    for line in warning_lines(records, is_said):
+    for line in warning_lines(records, was_shown):
         say(line, err=True)
     for line in scale_lines(root, records):
         say(line)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..formats.atomic import own_temporaries, write_text
+from ..formats.atomic import unique_temp_names, write_text
 from ..formats.datasets import looks_like_recording
 from ..formats.errors import InputError
 from ..formats.images import VIDEO_SUFFIXES
@@ -159,7 +159,7 @@ def reconstruct_one(
 
 
 def _write_failure(recording: Recording, reason: str) -> None:
-    with own_temporaries():  # a shard that is started twice may fail twice at the same moment
+    with unique_temp_names():  # a shard that is started twice may fail twice at the same moment
         write_text(recording.failure_file, reason.rstrip() + "\n")
 
 
@@ -196,6 +196,6 @@ def write_table(runs: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """batch.json and batch.md beside the runs."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
     lines = markdown_table(columns, ([str(row.get(c, "")) for c in columns] for row in rows))
-    with own_temporaries():  # all shards write them, often at the same moment
+    with unique_temp_names():  # all shards write them, often at the same moment
         write_json(runs / "batch.json", list(rows))
         write_text(runs / "batch.md", "\n".join(lines) + "\n")

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from ..formats.atomic import own_temporaries, temporary_of, write_text
+from ..formats.atomic import temporary_of, unique_temp_names, write_text
 from ..formats.errors import InputError, RecoverableError
 from ..formats.reading import require_listable, require_unicode
 from ..formats.video import probe_video
@@ -20,7 +20,7 @@ from .paper.constants import paper_inputs
 from .proxy.inputs import check_proxy, left_to_auto, proxy_inputs
 from .read_config import with_absolute_paths
 from .run.folder import RunFolder, load_records, load_settings, load_source
-from .run.lock import LEADER, LOCK, NotedProgress, RunBusyError, locked, make_folder
+from .run.lock import LEADER, LOCK, ProgressFile, RunBusyError, locked, make_folder
 from .run.manifest import StageRecord, recorded_config
 from .source.opening import source_digest
 from .system.device import require_device
@@ -79,7 +79,7 @@ def one_source(sources: Sequence[Path], run: RunFolder) -> Path:
         probe_video(source)
     if not same:
         make_folder(run.root)
-        with own_temporaries():  # no lock is held yet
+        with unique_temp_names():  # no lock is held yet
             write_text(path, text)
     return path
 
@@ -140,7 +140,7 @@ def resume(
     config: Config | None = None,
     until: str = STAGES[-1],
     workers: TaskWorkers | None = None,
-    once_locked: Callable[[], None] = lambda: None,
+    on_locked: Callable[[], None] = lambda: None,
     redo: str = "",
 ) -> dict[str, StageRecord]:
     """Go on with a run from its own settings, or from `config`; the stage `redo` and those after it are made again."""
@@ -154,7 +154,7 @@ def resume(
     config = _settled(config or load_settings(run))
     require_device(config.run.device)
     with locked(run):
-        once_locked()
+        on_locked()
         return _run(run, source, origin.digest, config, progress, until, workers, redo=redo)
 
 
@@ -264,7 +264,7 @@ def _run(
             )
 
     threads = config.run.threads or (workers.threads if workers else threads) or available_cpus()
-    with NotedProgress(progress, run) as noted:
+    with ProgressFile(progress, run) as noted:
         stages = all_stages(config.run.method)
         return run_stages(stages, run, source, digest, config, noted, until, same_source, workers, threads, redo)
 

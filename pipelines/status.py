@@ -17,7 +17,7 @@ from .networks.registry import ModelStore, metric_card
 from .proxy.selection import choose_depth, choose_semantics
 from .run.files import CALIBRATION
 from .run.folder import RunFolder, load_records, load_settings, load_source
-from .run.lock import Running, load_running
+from .run.lock import RunProgress, load_run_progress
 from .run.manifest import StageRecord, differing_settings
 from .system.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size, window_size, windows_of
 from .system.wording import quoted
@@ -51,7 +51,7 @@ class StageStatus:
     again: str = ""
     newer: tuple[str, ...] = ()
     networks: tuple[str, ...] = ()
-    running: Running | None = None
+    running: RunProgress | None = None
 
     @property
     def state_text(self) -> str:
@@ -142,7 +142,7 @@ def run_status(run: RunFolder, program: Program = lambda method: ()) -> RunStatu
     """
     records, config = load_records(run), load_settings(run)
     again, newer = _compared(run, program(config.run.method), records, config)
-    running = load_running(run)
+    running = load_run_progress(run)
     stages = []
     for name in STAGES:
         record = records.get(name)

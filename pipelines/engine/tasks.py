@@ -20,7 +20,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ...formats.atomic import own_temporaries
+from ...formats.atomic import unique_temp_names
 from ...formats.errors import InputError, RecoverableError
 from ...formats.textfile import read_json, write_json
 from ..config import STAGES, Config
@@ -230,7 +230,7 @@ class TaskBoard:
             )
         task = load_value(self.task(number))
         # On a disk without locks another process may do the same task.
-        with stopping_after_writes(folder), own_temporaries():
+        with stopping_after_writes(folder), unique_temp_names():
             try:
                 value = work(task, progress)
             except InputError as error:

@@ -29,7 +29,7 @@ from ..geometry.posed_depth import PosedDepth
 from ..mapping.measure import DrawnView, Shown, drawn_view
 from ..outcome import Outcome, load_outcome, maps_around
 from ..scene.world import World
-from ..system.parallel import LruSequence, abreast
+from ..system.parallel import LruSequence, map_lookahead
 from ..system.progress import Progress
 from ..system.values import load_value, save_value
 from ..types import VOID
@@ -138,7 +138,7 @@ def draw(outcome: Outcome, settings: ExportConfig, scratch: Path, progress: Prog
                 view = replace(view, unsure=resample_nearest(maps.confidence, camera.height, camera.width) < SURE)
             save_value(file, view)
 
-    done = abreast(draw_one, numbers, host_threads(outcome.require_map().means))
+    done = map_lookahead(draw_one, numbers, host_threads(outcome.require_map().means))
     for _ in progress.track(done, "drawing", len(numbers)):
         pass
 
@@ -156,7 +156,7 @@ def snap(scratch: Path, planes: Planes, progress: Progress, numbers: range) -> N
         if view.unsure is not None:
             save_value(file, snap_to_planes(view, planes))
 
-    done = abreast(snap_one, numbers, get_threads())
+    done = map_lookahead(snap_one, numbers, get_threads())
     for _ in progress.track(done, "straightening", len(numbers)):
         pass
 

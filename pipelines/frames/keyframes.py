@@ -16,9 +16,10 @@ from ..config import FramesConfig
 from ..engine.stages import StageContext
 from ..sfm.flow import corners, follow
 from ..source.faces import Faces
+from ..source.opening import AnySource
 from ..source.sharpness import reduce_image, sharpest_of_windows
 from ..types import Frame
-from .tasks import AnySource, picked
+from .masks import picked
 
 _TRACKED_SIDE = 480
 _MAX_CORNERS = 600

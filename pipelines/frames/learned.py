@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError
+from ...formats.images import to_grey
 from ...formats.reading import file_sha256
 from ..config import FramesConfig
 from ..networks.registry import Model, ModelStore
@@ -89,7 +90,7 @@ def picture_features(
     """Features of an (H, W, 3) image, of the kind that the settings ask for."""
     if learned is not None:
         return learned.extract(rgb, settings.max_features, left_out)
-    from ..sfm.features import extract_features, to_grey  # imports pycolmap
+    from ..sfm.features import extract_features  # imports pycolmap
 
     return extract_features(to_grey(rgb), settings.max_features, left_out)
 

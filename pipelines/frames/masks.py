@@ -13,18 +13,20 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ...formats.image_folder import frame_number, natural_key
-from ...formats.images import image_size, read_rgb
+from ...formats.images import image_size, read_rgb, to_grey
 from ...formats.reading import files_sha256
 from ..config import Config
+from ..engine.stages import StageContext
 from ..geometry.camera import ONE_CAMERA, Rig
 from ..masks.people import PeopleCards, PeopleFinder, people_cards
 from ..networks.registry import ModelStore
 from ..run.files import LEFT_OUT
-from ..source.opening import FolderSource, Source, VideoSource, open_source
+from ..source.opening import AnySource, FolderSource, Source, VideoSource, open_source
 from ..system.progress import Progress
 from ..types import Frame, any_of
 
 if TYPE_CHECKING:
+    from ..sfm.bridges import Picture
     from ..sfm.lens import Lens
     from ..source.faces import Faces
 
@@ -199,3 +201,20 @@ def _by_name(files: list[Path], source: Source) -> tuple[dict[int, Path], list[P
     names = [source.name(i, i) for i in range(source.expected_frames)]
     whose = {f"{Path(n).stem}.png": i for i, n in enumerate(names)} | {f"{n}.png": i for i, n in enumerate(names)}
     return {whose[p.name]: p for p in files if p.name in whose}, [p for p in files if p.name not in whose]
+
+
+def picked(context: StageContext, name: str) -> Path:
+    """The file of an image."""
+    return context.snapshot / "picked" / name
+
+
+def grey_of(context: StageContext, masks: FrameMasks, frame: Frame) -> Picture:
+    """Load a frame in grey, and its mask of pixels to leave out."""
+    gray = to_grey(read_rgb(picked(context, frame.name)))
+    return gray, masks.left_out(frame, gray.shape[1], gray.shape[0])
+
+
+def masks_of(context: StageContext, source: AnySource, faces: Faces | None, rig: Rig) -> FrameMasks:
+    """Return the masks of all frames; people only in frames that have been searched."""
+    places = context.snapshot / "people", context.snapshot / "picked"
+    return FrameMasks(context.config, source, *places, context.threads, faces, rig)

@@ -10,7 +10,7 @@ from ...formats.errors import InputError
 from ..engine.stages import StageContext
 from ..sfm.candidates import GIVEN_ALONE
 from ..sfm.consistency import unexplained
-from ..sfm.driver import Structure, StructureFromMotion, when_asked
+from ..sfm.driver import Structure, StructureFromMotion, no_prefetch
 from ..sfm.focal import calibrated
 from ..sfm.lens import FOCAL_GUESS, unknown_camera
 from ..sfm.matching import VerifiedPair, match_pair
@@ -131,7 +131,7 @@ def _without_prior(
         is_stated=False,
         extract=lambda i: motion.snapshots.value(features_name(i), lambda: motion.extract(i)),
         snapshots=snapshots,
-        divide=when_asked,
+        divide=no_prefetch,
     )
     try:
         found = free.run(keyframes)

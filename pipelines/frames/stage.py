@@ -35,24 +35,16 @@ from ..sfm.parallax import require_motion
 from ..sfm.rolling import straight_copy
 from ..source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
 from ..source.given import given_poses
-from ..source.opening import FolderSource, Source, open_source
+from ..source.opening import AnySource, FolderSource, Source, open_source
 from ..source.sharpness import reduce_image
 from ..system.parallel import parallel_map
 from ..types import Calibration, Frame, GivenPoses
 from .findings import in_world_of, settled_origin, to_sparse_model, warn_of_focal, warn_of_given, warn_of_structure
 from .inputs import require_several
 from .keyframes import KeyframeChoice, choose_keyframes, pick_frames
-from .masks import FrameMasks
+from .masks import FrameMasks, grey_of, masks_of, picked
 from .priors import solve
-from .tasks import (
-    TASKS,
-    AnySource,
-    grey_of,
-    known_camera,
-    masks_of,
-    picked,
-    structure_from_motion,
-)
+from .tasks import TASKS, known_camera, structure_from_motion
 
 _FEW_KEYFRAMES = 12
 _UNSURE_FOCAL = 0.05

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 
 import pycolmap
 
@@ -13,24 +12,20 @@ from ..engine.stages import StageContext
 from ..engine.tasks import Chunk
 from ..geometry.camera import Rig, rig_of
 from ..run.extension import parent_of
-from ..sfm.bridges import Picture
-from ..sfm.driver import Divide, StructureFromMotion, when_asked
-from ..sfm.features import to_grey
+from ..sfm.driver import Divide, StructureFromMotion, no_prefetch
 from ..sfm.lens import FOCAL_GUESS, calibrated_camera, to_pycolmap, unknown_camera
 from ..sfm.matching import match_features
 from ..sfm.snapshots import Snapshots
 from ..source.faces import Faces, find_faces
 from ..source.given import given_poses, read_intrinsics
-from ..source.opening import FolderSource, VideoSource, open_source
+from ..source.opening import AnySource, open_source
 from ..source.recording import RecordingSource
 from ..source.sharpness import reduced_size
 from ..system.memory import window_size
 from ..system.progress import Progress
 from ..types import Features, Frame, GivenPoses
 from .learned import open_learned, picture_features
-from .masks import FrameMasks
-
-AnySource = VideoSource | FolderSource | RecordingSource
+from .masks import FrameMasks, grey_of, masks_of, picked
 
 
 def known_camera(context: StageContext, source: AnySource, faces: Faces | None) -> tuple[pycolmap.Camera, str]:
@@ -58,23 +53,6 @@ def known_camera(context: StageContext, source: AnySource, faces: Faces | None) 
     return unknown_camera(width, height, FOCAL_GUESS * max(width, height), is_prior=False), "self-calibrated"
 
 
-def picked(context: StageContext, name: str) -> Path:
-    """The file of an image."""
-    return context.snapshot / "picked" / name
-
-
-def grey_of(context: StageContext, masks: FrameMasks, frame: Frame) -> Picture:
-    """Load a frame in grey, and its mask of pixels to leave out."""
-    gray = to_grey(read_rgb(picked(context, frame.name)))
-    return gray, masks.left_out(frame, gray.shape[1], gray.shape[0])
-
-
-def masks_of(context: StageContext, source: AnySource, faces: Faces | None, rig: Rig) -> FrameMasks:
-    """Return the masks of all frames; people only in frames that have been searched."""
-    places = context.snapshot / "people", context.snapshot / "picked"
-    return FrameMasks(context.config, source, *places, context.threads, faces, rig)
-
-
 def structure_from_motion(
     context: StageContext,
     camera: pycolmap.Camera,
@@ -83,7 +61,7 @@ def structure_from_motion(
     masks: FrameMasks,
     rig: Rig,
     given: GivenPoses | None,
-    divide: Divide = when_asked,
+    divide: Divide = no_prefetch,
 ) -> StructureFromMotion:
     """Prepare structure from motion of these frames; `origin` is as in `known_camera`."""
     settings, size = context.config.frames, (camera.width, camera.height)

@@ -45,7 +45,7 @@ def close_loops(
     before = reprojection_error(state, intrinsics)
     original = dict(state.sightings)
     if drifted:
-        straighten(state, loops)
+        distribute_drift(state, loops)
     add_sightings(state, loops)
     report = adjust_state(state, intrinsics, load_proxy, metric, tracking)
     after = reprojection_error(state, intrinsics, original)
@@ -71,7 +71,7 @@ def add_sightings(state: TrackState, loops: Sequence[Loop]) -> None:
             state.sightings[frame_id] = seen.joined(extra.select(~np.isin(extra.point, seen.point)))
 
 
-def straighten(state: TrackState, loops: Sequence[Loop]) -> None:
+def distribute_drift(state: TrackState, loops: Sequence[Loop]) -> None:
     """Spread the drift over the keyframes by a pose graph; points move with the first keyframe that sees them."""
     ids = state.keyframes
     place = {frame_id: n for n, frame_id in enumerate(ids)}

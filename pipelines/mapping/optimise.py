@@ -16,7 +16,7 @@ from ..config import MappingConfig
 from ..render.api import Rendering, in_view, marked_in_view, render
 from ..render.gaussian_map import GaussianMap
 from ..render.inspection import blending_weights, class_weights
-from ..system.parallel import LruSequence, abreast
+from ..system.parallel import LruSequence, map_lookahead
 from ..system.progress import Progress, SilentProgress, is_asked
 from .exposure import SOLID, expose, fit_exposure
 from .growth import HIGH_RELIABILITY, LOW_RELIABILITY, DensificationError, Growth, densification_error
@@ -166,7 +166,7 @@ class MapOptimiser:
     def _of_views(self, look: Callable[[int], T]) -> Iterator[T]:
         """Look at each view in turn; on a card, whose kernels wait for each other anyway, one by one."""
         self.state.settle_poses()
-        return abreast(look, range(len(self.views)), host_threads(self.state.parameters["means"]))
+        return map_lookahead(look, range(len(self.views)), host_threads(self.state.parameters["means"]))
 
     @torch.no_grad()
     def _color_errors(self, index: int, colors: Tensor) -> Tensor:

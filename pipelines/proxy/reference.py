@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError
+from ...formats.images import to_grey
 from ..depth.scale import DepthScale
 from ..engine.stages import StageContext
 from ..geometry.camera import unproject
@@ -20,7 +21,6 @@ from ..labels.segments import SegmentLabels
 from ..providers import DepthEstimate, DepthProvider, Sequence, resize_area
 from ..run.files import BACKBONE, GIVEN_POSES
 from ..run.folder import RunFolder
-from ..sfm.features import to_grey
 from ..sfm.flow import follow
 from ..sfm.given import agreement
 from ..source.opening import Source, VideoSource, open_source

@@ -26,7 +26,7 @@ from ..providers import (
 )
 from ..run.files import BACKBONE, CALIBRATION, FRAMES, LEFT_OUT, PROXY_MAPS
 from ..source.recording import open_recording
-from ..system.parallel import abreast
+from ..system.parallel import map_lookahead
 from ..system.progress import Progress
 from ..system.values import load_value, save_value
 from ..types import Frame, Intrinsics, ProxyMaps, any_of
@@ -145,7 +145,7 @@ def make_depths(task: Chunk, progress: Progress) -> None:
     """The depths of the frames."""
     work, frames = _opened(task, progress)
     load_state(work.depths, task.known["depths"])
-    done = abreast(work.save_depth, frames[task.first : task.last], work.context.threads)
+    done = map_lookahead(work.save_depth, frames[task.first : task.last], work.context.threads)
     for _ in progress.track(done, "depth", len(task.numbers)):
         pass
 
@@ -179,6 +179,6 @@ def make_maps(task: Chunk, progress: Progress) -> dict[int, NDArray[np.float32]]
             PROXY_MAPS.save(work.context.folder, maps, frame.id)
         return frame.id, labels.descriptor
 
-    made = abreast(make, frames[task.first : task.last], work.context.threads)
+    made = map_lookahead(make, frames[task.first : task.last], work.context.threads)
     looks = progress.track(made, "classes", len(task.numbers))
     return {frame_id: descriptor for frame_id, descriptor in looks if descriptor is not None}

@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, TypeVar
 
-from ...formats.atomic import machine_mark, process_mark
+from ...formats.atomic import machine_token, process_token
 from ...formats.errors import InputError, RecoverableError
 from ...formats.textfile import read_json
 from ..system.progress import BEGUN, Progress, StageEvent, about, log
@@ -181,7 +181,7 @@ def shows_life(path: Path) -> bool:
 
 
 def _made(path: Path) -> bool:
-    about = {"host": platform.node(), "mark": machine_mark(), "process": os.getpid(), "since": time.time_ns()}
+    about = {"host": platform.node(), "mark": machine_token(), "process": os.getpid(), "since": time.time_ns()}
     for _ in range(2):
         with suppress(FileExistsError), path.open("x", encoding="utf-8") as file:
             file.write(json.dumps(about))
@@ -194,7 +194,7 @@ def _made(path: Path) -> bool:
 def _taken_away(path: Path) -> bool:
     """Whether the file was that of a dead process, and is gone. Of several who try, one moves it aside; who has moved
     another one than he has judged gives it back."""
-    aside = path.with_name(f"{path.name}-{process_mark()}")
+    aside = path.with_name(f"{path.name}-{process_token()}")
     try:
         judged = path.read_bytes()
         if _is_alive(path, judged, aside):
@@ -219,7 +219,7 @@ def _is_alive(path: Path, content: bytes, probe: Path) -> bool:
         return False
     with suppress(ValueError, KeyError, TypeError, OverflowError):
         about = json.loads(content)
-        if about["mark"] == machine_mark():
+        if about["mark"] == machine_token():
             return _is_process(about["process"])
     return True
 
@@ -252,7 +252,7 @@ def _beat(path: Path, mine: bytes, ended: threading.Event) -> None:
 
 
 @dataclass(frozen=True)
-class Running:
+class RunProgress:
     """The stage that is being made; of the piece of work that it is at how much is `done`, of how many (0: unknown);
     left: seconds to the end of all stages, 0 where nothing is known."""
 
@@ -269,7 +269,7 @@ class Running:
         return f"running{share}" + (f", {about(self.left)} left" if self.left else "")
 
 
-class NotedProgress:
+class ProgressFile:
     """Shows what another one shows, and notes it in the run while a stage is being made, seldom enough to cost nothing.
     The file goes with the block."""
 
@@ -278,7 +278,7 @@ class NotedProgress:
         self._event: StageEvent | None = None
         self._written = 0.0
 
-    def __enter__(self) -> NotedProgress:
+    def __enter__(self) -> ProgressFile:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -304,18 +304,18 @@ class NotedProgress:
         if self._event is None:
             return
         self._written = time.monotonic()
-        now = Running(self._event.name, label, done, of, float(self._event.left() or 0.0))
+        now = RunProgress(self._event.name, label, done, of, float(self._event.left() or 0.0))
         temporary = self._file.with_suffix(".tmp")
         with suppress(OSError):  # who works must not stop for who watches
             temporary.write_text(json.dumps(asdict(now)), encoding="utf-8")
             os.replace(temporary, self._file)
 
 
-def load_running(run: RunFolder) -> Running | None:
+def load_run_progress(run: RunFolder) -> RunProgress | None:
     """Load the progress of the process at work; None where there is none, or no stage has started."""
     path = Path(run.root / PROGRESS)
     if not path.exists() or not is_led(run):
         return None
     with suppress(InputError, ValueError):
-        return dataclass_from_json(Running, read_json(path))
+        return dataclass_from_json(RunProgress, read_json(path))
     return None

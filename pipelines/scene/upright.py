@@ -18,7 +18,7 @@ from ..geometry.room_layout import Gravity, find_gravity, floor_plane, name_stru
 from ..geometry.voxels import VOXELS_PER_DEPTH, Voxels, gather_depths
 from ..mapping.measure import depth_view
 from ..outcome import Outcome, maps_around, spread_sample
-from ..system.parallel import abreast, parallel_map
+from ..system.parallel import map_lookahead, parallel_map
 from ..types import Intrinsics
 
 _MIN_LENGTH = 0.05
@@ -107,7 +107,7 @@ def surface_voxels(outcome: Outcome, rows: Sequence[int]) -> Voxels:
     def view(row: int) -> PosedDepth:
         return depth_view(near(int(t.frame_ids[row])), t.cam_from_world[row], camera)
 
-    views = list(abreast(view, rows, host_threads(outcome.require_map().means)))
+    views = list(map_lookahead(view, rows, host_threads(outcome.require_map().means)))
     seen = np.concatenate([np.zeros(0), *(v.depth[v.trust > 0] for v in views)])
     size = float(np.median(seen)) / VOXELS_PER_DEPTH if len(seen) else 1.0
     return gather_depths(views, size)

@@ -36,7 +36,7 @@ from .given import posed_model
 from .lens import FOCAL_GUESS, unknown_camera
 from .matching import VerifiedPair, write_database
 from .rolling import NO_READOUT, Readout, adjust_rolling, read_readout, straight_copy
-from .scale_repair import mended
+from .scale_repair import repair_scale_breaks
 from .snapshots import Snapshots
 from .windows import WIDE, close_loops
 
@@ -56,17 +56,17 @@ _TRACKS, _TRACKS_IN_A_CHAIN = 150, 300
 """Tracks, the longest, by which the global mapper places each view; the last adjustment has all of them again. Of nine
 recordings 150 give poses as good as 300 in two thirds of the time. Where only neighbours share any they do not: a
 corridor that is 0.3 cm off with 300 is 3 m off with 150, too far for its loops to close."""
-_Tried = tuple[pycolmap.Reconstruction, str, ModelReport]
+_ScoredModel = tuple[pycolmap.Reconstruction, str, ModelReport]
 """A model, the mapper that made it, and how good it is."""
 
 
-def _worth(tried: _Tried) -> float:
+def _selection_score(tried: _ScoredModel) -> float:
     """To choose by: the score, of a model that starts from given poses so much more that it need only be as good."""
     return tried[2].score / (_AS_GOOD if tried[1].startswith(GIVEN) else 1.0)
 
 
 @dataclass(frozen=True)
-class Views:
+class KeyframeSet:
     """Keyframes as structure from motion sees them: features, their pixels (F, 2) again for when descriptors are
     dropped, times (K,) in seconds, the numbers of those that constrain scale weakly, and the user's poses (K, 4, 4),
     NaN where none, if any."""
@@ -77,12 +77,12 @@ class Views:
     weak: list[int]
     given: NDArray[np.float64] | None = None
 
-    def part(self, window: range) -> Views:
+    def part(self, window: range) -> KeyframeSet:
         """Select the keyframes of a window, renumbered from 0."""
         numbers = slice(window.start, window.stop)
         weak = [k - window.start for k in self.weak if k in window]
         given = None if self.given is None else self.given[numbers]
-        return Views(self.features.part(window), self.xy[numbers], self.times[numbers], weak, given)
+        return KeyframeSet(self.features.part(window), self.xy[numbers], self.times[numbers], weak, given)
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Adjusted:
 
 
 def _better(
-    first: Adjusted | None, second: Adjusted | None, views: Views, pairs: Sequence[VerifiedPair]
+    first: Adjusted | None, second: Adjusted | None, views: KeyframeSet, pairs: Sequence[VerifiedPair]
 ) -> Adjusted | None:
     """The first of two models of one recording, unless only the second is one or explains its matches clearly better
     and as many of the views."""
@@ -123,7 +123,7 @@ class Candidates:
     is_extension: bool = False
     cam_from_rig: NDArray[np.float64] = field(default_factory=lambda: ONE_CAMERA.cam_from_rig)
 
-    def _calibrated(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
+    def _calibrated(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
         """The best model; of a stated camera the model of one that is found anew, where that explains the images
         much better, or where the stated one gives none."""
         held = self._best(views, pairs)
@@ -136,7 +136,7 @@ class Candidates:
         free = next(filter(None, (self._freed(name, views, pairs) for name in ("stated", "unknown"))), None)
         return _better(held, free, views, pairs)
 
-    def _freed(self, start: str, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
+    def _freed(self, start: str, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
         """The model of a camera that is found anew, from the stated focal length or from nothing."""
         is_prior, (width, height) = start == "stated", (self.camera.width, self.camera.height)
         focal = self.camera.mean_focal_length() if is_prior else FOCAL_GUESS * max(width, height)
@@ -145,7 +145,7 @@ class Candidates:
         camera = unknown_camera(width, height, focal, is_prior)
         return replace(self, camera=camera, is_fixed=False, is_stated=False, snapshots=snapshots)._best(views, pairs)
 
-    def _best(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
+    def _best(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
         """The best model, its camera calibrated unless it is fixed; where that leaves the focal length unsure, of two
         that start from different ones."""
         found = self._adjusted(views, pairs)
@@ -158,7 +158,7 @@ class Candidates:
         other = replace(self, asks_pairs=False, snapshots=snapshots)._adjusted(views, pairs)
         return _better(found, other, views, pairs)
 
-    def _adjusted(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
+    def _adjusted(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
         """The best model, its camera calibrated unless it is fixed; with the readout of a rolling shutter, where one is
         given or the model shows it."""
         mappers = ("global", "incremental")
@@ -174,42 +174,42 @@ class Candidates:
 
     def _map(
         self,
-        views: Views,
+        views: KeyframeSet,
         pairs: Sequence[VerifiedPair],
         mappers: Sequence[str] = ("global", "incremental"),
-    ) -> _Tried | None:
+    ) -> _ScoredModel | None:
         """The best of the mappers' models, None where none is any; the next is only made when those before it are
         doubtful."""
-        best: _Tried | None = None
+        best: _ScoredModel | None = None
         possible = {GIVEN} if views.given is not None else set()
         possible |= {name for name in mappers if name != GIVEN and self.config.mapper in ("auto", name)}
         wanted = [name for name in mappers if name in possible]
         for name in self.progress.track(wanted, "camera model", len(wanted)):
             if best is not None and (best[2].is_sound or (best[1].startswith(NEIGHBOURS) and name != GIVEN)):
                 continue
-            found = self._tried(name, views, pairs, pairs)
+            found = self._build_model(name, views, pairs, pairs)
             if found is not None and (name == GIVEN or (found[2].is_consistent and not found[2].is_whole)):
-                found = self._grown(found, views, pairs, pairs)
-            unfolded = None if found is None or not found[2].contradicted else self._unfolded(views, pairs)
+                found = self._register_remaining(found, views, pairs, pairs)
+            unfolded = None if found is None or not found[2].contradicted else self._remap_from_neighbours(views, pairs)
             # Of two alike the one before, but the given poses are evidence that no match is.
-            best = max(filter(None, (best, found, unfolded)), key=_worth, default=None)
+            best = max(filter(None, (best, found, unfolded)), key=_selection_score, default=None)
         if best is None or best[2].registered < min(_MIN_KEYFRAMES, best[2].total) or best[2].points < _MIN_POINTS:
             return None
         return best
 
-    def _unfolded(self, views: Views, pairs: Sequence[VerifiedPair]) -> _Tried | None:
+    def _remap_from_neighbours(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> _ScoredModel | None:
         """The model of a path that things which repeat have folded: made of what neighbours share, for little repeats
         within so few images, its loops closed by the other pairs that nearly agree with that."""
         total, reach = self._places(views.xy), self.config.overlap
         near = [p for p in pairs if abs(p.first % total - p.second % total) <= reach]
-        straight = self._tried(NEIGHBOURS, views, near, pairs)
+        straight = self._build_model(NEIGHBOURS, views, near, pairs)
         if straight is None or straight[2].contradicted:
             return straight
-        closed = self._closed(straight, views, pairs)
-        grown = self._grown(closed, views, pairs, near)
-        return closed if grown is closed else self._closed(grown, views, pairs)
+        closed = self._close_loops(straight, views, pairs)
+        grown = self._register_remaining(closed, views, pairs, near)
+        return closed if grown is closed else self._close_loops(grown, views, pairs)
 
-    def _closed(self, found: _Tried, views: Views, pairs: Sequence[VerifiedPair]) -> _Tried:
+    def _close_loops(self, found: _ScoredModel, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> _ScoredModel:
         """The model with those points made one that are one by matched pairs which nearly agree, and all adjusted
         by a wide loss and a narrow one, again and again as long as that makes it better."""
         while True:
@@ -225,9 +225,9 @@ class Candidates:
                 return found
             found = closed
 
-    def _grown(
-        self, found: _Tried, views: Views, every: Sequence[VerifiedPair], known: Sequence[VerifiedPair]
-    ) -> _Tried:
+    def _register_remaining(
+        self, found: _ScoredModel, views: KeyframeSet, every: Sequence[VerifiedPair], known: Sequence[VerifiedPair]
+    ) -> _ScoredModel:
         """The model with the keyframes that it leaves added one by one, each by all that it shares with those placed,
         where that makes it better; `known` are the pairs that it was made from."""
         left = set(range(len(views.xy))) - {i - 1 for i in found[0].reg_image_ids()}
@@ -235,35 +235,37 @@ class Candidates:
         if not more:
             return found
         pairs = sorted({(p.first, p.second): p for p in (*known, *more)}.values(), key=lambda p: (p.first, p.second))
-        grown = self._tried(f"{found[1]}-grown", views, pairs, every, found[0])
+        grown = self._build_model(f"{found[1]}-grown", views, pairs, every, found[0])
         return found if grown is None or grown[2].score < found[2].score else grown
 
-    def _tried(
+    def _build_model(
         self,
         name: str,
-        views: Views,
+        views: KeyframeSet,
         pairs: Sequence[VerifiedPair],
         every: Sequence[VerifiedPair],
         start: pycolmap.Reconstruction | None = None,
-    ) -> _Tried | None:
+    ) -> _ScoredModel | None:
         """A mapper's model of these pairs, judged by `every` one; one to `start` from is added to."""
         model = self.snapshots.model(name, lambda work: self._run_mapper(name, work, views, pairs, start))
         return None if model is None else self._judged(name, model, views, every)
 
-    def _judged(self, name: str, model: pycolmap.Reconstruction, views: Views, every: Sequence[VerifiedPair]) -> _Tried:
+    def _judged(
+        self, name: str, model: pycolmap.Reconstruction, views: KeyframeSet, every: Sequence[VerifiedPair]
+    ) -> _ScoredModel:
         """The model without what its neighbours contradict, repaired, and how good it is."""
         seen = every, views.xy, self._places(views.xy), self.config.overlap
         model = without_misplaced(model, *seen)
         report = judge(model, *seen)
         if views.weak:
-            model, report = mended(model, report, *seen, self.seed)
+            model, report = repair_scale_breaks(model, report, *seen, self.seed)
         return model, name, report
 
     def _run_mapper(
         self,
         name: str,
         work: Path,
-        views: Views,
+        views: KeyframeSet,
         pairs: Sequence[VerifiedPair],
         start: pycolmap.Reconstruction | None,
     ) -> pycolmap.Reconstruction | None:

@@ -19,7 +19,7 @@ from ..system.progress import log
 from ..types import Features, Vocabulary
 from .adjust import adjust
 from .bridges import Picture, weakly_connected, with_bridges
-from .candidates import GIVEN_ALONE, Adjusted, Candidates, Views
+from .candidates import GIVEN_ALONE, Adjusted, Candidates, KeyframeSet
 from .consistency import ModelReport, judge
 from .given import bare_model, set_best_focal
 from .lens import set_lens
@@ -44,7 +44,7 @@ _FEATURES_SHARE = 0.25
 Divide = Callable[[str, int, dict[str, NDArray]], None]
 
 
-def when_asked(name: str, count: int, known: dict[str, NDArray]) -> None:
+def no_prefetch(name: str, count: int, known: dict[str, NDArray]) -> None:
     """Nothing beforehand: what is not in the snapshots is made when it is asked for."""
 
 
@@ -83,7 +83,7 @@ class StructureFromMotion(Candidates):
     threads: int
     memory: float = math.inf
     window: int = WINDOW
-    divide: Divide = when_asked
+    divide: Divide = no_prefetch
     given: NDArray[np.float64] | None = None
     warn: Callable[[str], None] = log.warning
 
@@ -115,7 +115,7 @@ class StructureFromMotion(Candidates):
             found.model, report, found.mapper, found.focal_sd, features, vocabulary, tried, pairs, pieces, found.readout
         )
 
-    def _as_given(self, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
+    def _as_given(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
         """The given poses as they are, without a point."""
         if views.given is None:
             return None
@@ -132,7 +132,7 @@ class StructureFromMotion(Candidates):
         return windows_of(count, self.window) if len(self.cam_from_rig) == 1 else [range(count)]
 
     def _in_windows(
-        self, windows: Sequence[range], views: Views, pairs: Sequence[VerifiedPair]
+        self, windows: Sequence[range], views: KeyframeSet, pairs: Sequence[VerifiedPair]
     ) -> tuple[Adjusted | None, list[pycolmap.Reconstruction]]:
         """The models of the windows of a long recording, joined, in the camera that all of them determine; and the
         parts that are not connected to the largest."""
@@ -160,7 +160,7 @@ class StructureFromMotion(Candidates):
             together(other, views.xy, views.times, readout)
         return replace(whole, readout=readout), others
 
-    def _window(self, window: range, views: Views, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
+    def _window(self, window: range, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
         """The model of one of several, made unless it is stored."""
         snapshots = Snapshots(self.snapshots.folder / f"window_{window.start:06d}_{window.stop:06d}")
         snapshots.folder.mkdir(exist_ok=True)
@@ -191,7 +191,7 @@ class StructureFromMotion(Candidates):
 
     def _pieces(
         self,
-        views: Views,
+        views: KeyframeSet,
         pairs: Sequence[VerifiedPair],
         model: pycolmap.Reconstruction,
         apart: Sequence[pycolmap.Reconstruction],
@@ -210,7 +210,7 @@ class StructureFromMotion(Candidates):
     def _pieces_of(
         self,
         left: set[int],
-        views: Views,
+        views: KeyframeSet,
         pairs: Sequence[VerifiedPair],
         camera: pycolmap.Camera,
         numbers: Iterator[int],
@@ -242,7 +242,7 @@ class StructureFromMotion(Candidates):
         return len(report.largest) >= self.config.least_piece and report.is_consistent
 
     def _largest_first(
-        self, found: Adjusted, pieces: list[pycolmap.Reconstruction], views: Views
+        self, found: Adjusted, pieces: list[pycolmap.Reconstruction], views: KeyframeSet
     ) -> tuple[Adjusted, list[pycolmap.Reconstruction]]:
         """The largest model, which calibrates the camera of all where it is surer of it, and the others; all with the
         readout of the first."""
@@ -308,7 +308,7 @@ class StructureFromMotion(Candidates):
 
     def _bridged(
         self, keyframe_ids: Sequence[int], features: LruSequence[Features], pairs: list[VerifiedPair]
-    ) -> tuple[Views, list[VerifiedPair]]:
+    ) -> tuple[KeyframeSet, list[VerifiedPair]]:
         """All views, with points followed through keyframes that hold the path's size badly."""
         weak = weakly_connected(pairs, len(features), self.config.overlap) if len(self.cam_from_rig) == 1 else []
         if weak:
@@ -317,7 +317,7 @@ class StructureFromMotion(Candidates):
             features, pairs = with_bridges(features, pairs, told, lambda k: self.picture(keyframe_ids[k]), stored)
         times = np.array([self.time(k) for k in keyframe_ids])
         given = None if self.given is None else self.given[list(keyframe_ids)]
-        return Views(features, [f.xy for f in features], times, weak, given), pairs
+        return KeyframeSet(features, [f.xy for f in features], times, weak, given), pairs
 
 
 def _blocks(proposed: Sequence[tuple[int, int]]) -> list[Sequence[tuple[int, int]]]:

@@ -22,11 +22,6 @@ _SUPPORT = 2.0
 """Of a feature's scale: nearer to a mask than this, what moves there affects its position."""
 
 
-def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB -> (H, W) grey."""
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
-
-
 def extract_features(
     grey: NDArray[np.uint8],
     count: int,

@@ -173,7 +173,7 @@ class RollingModel:
         )  # fmt: skip
         return bundle, np.asarray(camera.cam_from_img(self.plain)) * focal + half, pinhole
 
-    def straighten(self, bundle: Bundle, xy: Array, pinhole: Intrinsics, readout: Readout) -> None:
+    def rectify_observations(self, bundle: Bundle, xy: Array, pinhole: Intrinsics, readout: Readout) -> None:
         """Put the model's observations where they would be in frames taken at once, by `bundle`'s poses and points."""
         velocity = velocities(bundle.cam_from_world, self.times)
         now: Array = rectified_bundle(bundle, xy, pinhole, velocity, readout).obs_xy
@@ -195,7 +195,7 @@ def straight_copy(
     """The model with its observations where they would be in frames taken at once; the one given stays as it is."""
     rolling = RollingModel(pycolmap.Reconstruction(model), xy, times)
     if any(readout):
-        rolling.straighten(*rolling.bundle(), readout)
+        rolling.rectify_observations(*rolling.bundle(), readout)
     return rolling.model
 
 
@@ -221,7 +221,7 @@ def adjust_rolling(
         seconds = math.hypot(*readout)
         axis = readout[0] / seconds, readout[1] / seconds
     for _ in range(_ROUNDS):
-        rolling.straighten(*seen, (axis[0] * seconds, axis[1] * seconds))
+        rolling.rectify_observations(*seen, (axis[0] * seconds, axis[1] * seconds))
         solve(rolling.model, rolling.images, refine_camera, roughly=True)
         seen = rolling.bundle()
         if readout is None:
@@ -230,7 +230,7 @@ def adjust_rolling(
     if readout is None and seconds**2 * share < MIN_GAIN:
         return None
     found = axis[0] * seconds, axis[1] * seconds
-    rolling.straighten(*seen, found)
+    rolling.rectify_observations(*seen, found)
     focal_sd = adjust(rolling.model, refine_camera, narrowly)
     rolling.put(rolling.plain)
     return rolling.model, found, focal_sd

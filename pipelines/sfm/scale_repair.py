@@ -24,7 +24,7 @@ _MIN_ANGLE = 0.01
 Array = NDArray[np.float64]
 
 
-def mended(
+def repair_scale_breaks(
     model: pycolmap.Reconstruction, report: ModelReport, pairs: Sequence[VerifiedPair], xy: Sequence[Array],
     total: int, reach: int, seed: int,
 ) -> tuple[pycolmap.Reconstruction, ModelReport]:  # fmt: skip
@@ -35,11 +35,11 @@ def mended(
         if {owner[k] for k in owner if k <= seam.before} & {owner[k] for k in owner if k >= seam.after}:
             continue  # a loop holds the two sides
         for shared in sorted((seam.before, seam.after), key=_ties(model, total, reach)):
-            ratio, count = size_ratio(model, shared, pairs, xy, reach)
+            ratio, count = scale_ratio(model, shared, pairs, xy, reach)
             if count < MIN_POINTS:
                 continue
             tried = pycolmap.Reconstruction(model)
-            resize_behind(tried, shared, ratio)
+            rescale_after(tried, shared, ratio)
             filter_outliers(tried)
             complete_tracks(tried, pairs, seed)
             # What follows only takes observations away.
@@ -65,7 +65,7 @@ def _ties(model: pycolmap.Reconstruction, total: int, reach: int) -> Callable[[i
     return ties
 
 
-def size_ratio(
+def scale_ratio(
     model: pycolmap.Reconstruction, keyframe: int, pairs: Sequence[VerifiedPair], xy: Sequence[Array], reach: int
 ) -> tuple[float, int]:
     """Return the scale before a keyframe relative to the scale after it, as the median ratio of depths over features
@@ -105,7 +105,7 @@ def _depths(second_from_first: Array, first: Array, second: Array) -> tuple[Arra
     return -(turned * moved).sum(1) / square, np.sqrt(square)
 
 
-def resize_behind(model: pycolmap.Reconstruction, keyframe: int, ratio: float) -> None:
+def rescale_after(model: pycolmap.Reconstruction, keyframe: int, ratio: float) -> None:
     """Make everything after a keyframe, and the points that are seen mostly from there, larger by `ratio`, about
     the keyframe's position, in place."""
     image = keyframe + 1

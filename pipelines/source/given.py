@@ -16,13 +16,11 @@ from ...formats.reading import file_sha256, files_sha256, home_expanded, reachin
 from ...formats.textfile import read_rows
 from ..config import FramesConfig
 from ..types import Frame, GivenPoses
-from .opening import FolderSource, VideoSource, Warn
-from .recording import RecordingSource
+from .opening import AnySource, VideoSource, Warn
 
 _HOW = "give fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file that holds them"
 _MAX_NAMED = 8
 
-AnySource = VideoSource | FolderSource | RecordingSource
 MIN_POSES = 3
 """Poses that belong to an image, below which a file is taken for one of another recording."""
 

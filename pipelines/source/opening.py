@@ -195,6 +195,9 @@ class FolderSource:
         return self.headers.focal_px(self.width, self.height)
 
 
+AnySource = VideoSource | FolderSource | RecordingSource
+
+
 def _without_depth_maps(images: list[Path]) -> list[Path]:
     """All but images of 16 bits in one channel, if there are others: some data sets keep depth beside colour."""
     depth = {path for path in images if path.suffix.lower() in (".png", ".tif", ".tiff") and is_depth_map(path)}

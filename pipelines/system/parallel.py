@@ -14,7 +14,7 @@ from .memory import release_free_memory
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 R = TypeVar("R")
-ABREAST = 2
+LOOKAHEAD = 2
 """Things of which each already has its loops on all threads: the second is there for what of the first has not."""
 
 
@@ -28,22 +28,22 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T], threads: int) -
             waiting.extend(pool.submit(function, item) for item in itertools.islice(items, 1))
 
 
-def abreast(function: Callable[[T], R], items: Iterable[T], threads: int) -> Iterator[R]:
-    """`map`, in order, with `ABREAST` of them in work where there is more than one thread; none is begun before those
-    are done that come `ABREAST` before it, so that no more than these need memory."""
-    if threads < ABREAST:
+def map_lookahead(function: Callable[[T], R], items: Iterable[T], threads: int) -> Iterator[R]:
+    """`map`, in order, with `LOOKAHEAD` of them in work where there is more than one thread; none is begun before those
+    are done that come `LOOKAHEAD` before it, so that no more than these need memory."""
+    if threads < LOOKAHEAD:
         yield from map(function, items)
         return
     items = iter(items)
-    with ThreadPoolExecutor(ABREAST) as pool:
-        waiting = [pool.submit(function, item) for item in itertools.islice(items, ABREAST)]
+    with ThreadPoolExecutor(LOOKAHEAD) as pool:
+        waiting = [pool.submit(function, item) for item in itertools.islice(items, LOOKAHEAD)]
         while waiting:
             result = waiting.pop(0).result()
             waiting.extend(pool.submit(function, item) for item in itertools.islice(items, 1))
             yield result
 
 
-class Kept(Generic[K, R]):
+class LruCache(Generic[K, R]):
     """The values of `make` for the keys asked for last, at most `limit` of them; who asks for one that another thread
     is making waits for it. `make` may ask others of its kind, but not itself in a circle."""
 

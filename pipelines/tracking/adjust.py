@@ -239,9 +239,9 @@ def follow_others(state: TrackState, intrinsics: Intrinsics, adjusted: set[int],
 
 def settle(frame_id: int, state: TrackState, intrinsics: Intrinsics, velocity: dict[int, Array]) -> None:
     """Settle a frame's pose on the points it sees, in place; of its sightings those stay that are still known.
-    velocity: as in `seen_at_once`."""
+    velocity: as in `global_shutter_pixels`."""
     seen = state.sightings[frame_id]
-    xy = seen_at_once(frame_id, seen, state, intrinsics, velocity)
+    xy = global_shutter_pixels(frame_id, seen, state, intrinsics, velocity)
     xy -= source_errors(seen, state, intrinsics, velocity)
     known = np.asarray(np.isfinite(xy).all(1))
     seen, xy = seen.select(known), xy[known]
@@ -260,11 +260,11 @@ def source_errors(seen: Sightings, state: TrackState, intrinsics: Intrinsics, ve
         _, followed, rows = np.intersect1d(seen.point[mine], state.sightings[source].point, return_indices=True)
         there = state.sightings[source].select(rows)
         modelled, _ = project(se3.transform(state.poses[source], state.points[there.point]), intrinsics)
-        out[mine[followed]] = seen_at_once(source, there, state, intrinsics, velocity) - modelled
+        out[mine[followed]] = global_shutter_pixels(source, there, state, intrinsics, velocity) - modelled
     return out
 
 
-def seen_at_once(
+def global_shutter_pixels(
     frame_id: int, seen: Sightings, state: TrackState, intrinsics: Intrinsics, velocity: dict[int, Array]
 ) -> Array:
     """(Q, 2) pixels of a frame's sightings, but for what a rolling shutter adds: velocity by frame, empty for none."""

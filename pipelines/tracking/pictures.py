@@ -9,11 +9,11 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ...formats.images import to_grey
 from ..config import FramesConfig
 from ..frames.learned import open_learned, picture_features
 from ..run.files import CALIBRATION, FEATURES, FRAMES, VOCABULARY
 from ..run.folder import RunFolder
-from ..sfm.features import to_grey
 from ..sfm.retrieval import describe
 from ..sfm.rolling import Shutter
 from ..system.parallel import LruSequence

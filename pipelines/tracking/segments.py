@@ -155,7 +155,7 @@ def carry_given(context: StageContext, state: TrackState) -> dict[str, Any]:
     given = context.run.find(GIVEN_POSES)
     if given is None:
         return {}
-    lose_unfit(state, given)
+    drop_inconsistent_segments(state, given)
     joined = join_by_given(state, given)
     carried = pose_lost(state, given)
     if joined:
@@ -170,7 +170,7 @@ def carry_given(context: StageContext, state: TrackState) -> dict[str, Any]:
     return {"given_joined": joined, "given_carried": len(carried)}
 
 
-def lose_unfit(state: TrackState, given: GivenPoses) -> None:
+def drop_inconsistent_segments(state: TrackState, given: GivenPoses) -> None:
     """Lose, in place, every segment that the given poses cannot place (too short for its scale, or contradicted by
     them) but could replace: where most of its frames have one, and more frames outside than are in it."""
     known = set(np.flatnonzero(given.known).tolist())

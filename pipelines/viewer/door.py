@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 from ...formats.errors import InputError, install_command
 
 
-def is_welcome(host_header: str, origin: str | None, served_host: str) -> bool:
+def is_same_origin(host_header: str, origin: str | None, served_host: str) -> bool:
     """Whether a request may be answered, by its Host header, its Origin (None: no browser's page sends it), and the
     address that the server was told to serve on.
 
@@ -32,8 +32,8 @@ def is_welcome(host_header: str, origin: str | None, served_host: str) -> bool:
 
 
 @contextmanager
-def guarding(served_host: str) -> Iterator[None]:
-    """Around the making of a viser server: whatever it serves meanwhile is asked through `is_welcome` first.
+def guard_server(served_host: str) -> Iterator[None]:
+    """Around the making of a viser server: whatever it serves meanwhile is asked through `is_same_origin` first.
 
     viser has no way to say so. It hands its own answers to `websockets.asyncio.server.serve`, which is replaced here
     for as long as the server starts. Raises InputError when viser started without it, as another version may.
@@ -49,7 +49,7 @@ def guarding(served_host: str) -> Iterator[None]:
         def answer(connection: Any, request: Any) -> Any:
             hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
             alone = len(hosts) == 1 and len(origins) <= 1
-            if not alone or not is_welcome(hosts[0], origins[0] if origins else None, served_host):
+            if not alone or not is_same_origin(hosts[0], origins[0] if origins else None, served_host):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "This page is not from this viewer.\n")
             return process_request(connection, request) if process_request is not None else None
 

@@ -7,7 +7,7 @@ from contextlib import suppress
 from ...formats.errors import InputError
 from ..config import STAGES
 from ..run.folder import RunFolder, load_records
-from ..run.lock import load_running
+from ..run.lock import load_run_progress
 from ..system.progress import log
 from ..system.wording import quoted
 from .scene import ViewerScene, load_scenes
@@ -27,7 +27,7 @@ def standing(run: RunFolder) -> str:
     if not left:
         return ""
     shown = next((text for name, text in reversed(_SHOWING.items()) if name in records), "nothing yet")
-    running = load_running(run)
+    running = load_run_progress(run)
     if running is None:
         what = f"{', '.join(left)}. No job is running: `msgs-slam resume {quoted(run.root.name)}` goes on"
     else:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from ...formats.errors import InputError, install_command
 from ..export.extra.floor_plan import walls_of_run
 from ..source.sharpness import at_most_wide
-from .door import guarding
+from .door import guard_server
 from .flight import Flight
 from .live import Watch
 from .scene import MODES, POINTS, ViewerCamera, ViewerScene, client_view, load_scenes, move_client, shown_pose
@@ -55,7 +55,7 @@ def open_viewer(path: Path, host: str = "127.0.0.1", port: int = 8080) -> Viewer
     except ImportError as error:
         raise InputError(f"the viewer needs viser: {install_command('msgs-slam[viewer]')}") from error
     try:
-        with guarding(host):
+        with guard_server(host):
             server = viser.ViserServer(host=host, port=port, label=f"MSGS-SLAM {plain(scenes[0].title)}", verbose=False)
     except OSError as error:
         raise InputError(f"port {port} cannot be used ({error.strerror}): choose another with --port") from error

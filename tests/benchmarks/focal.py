@@ -29,7 +29,7 @@ from tracking import in_process
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry.camera import ONE_CAMERA
 from msgs_slam.pipelines.geometry.se3 import align_points
-from msgs_slam.pipelines.sfm.candidates import Adjusted, Candidates, Views
+from msgs_slam.pipelines.sfm.candidates import Adjusted, Candidates, KeyframeSet
 from msgs_slam.pipelines.sfm.lens import unknown_camera
 from msgs_slam.pipelines.sfm.matching import VerifiedPair, verify_matches, write_database
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
@@ -51,7 +51,7 @@ RECORDINGS = {
 class Input:
     """What the mappers get, and the truth: world_from_cam (4, 4) of each view, the focal length in pixels and k1."""
 
-    views: Views
+    views: KeyframeSet
     pairs: list[VerifiedPair]
     camera: pycolmap.Camera
     truth: list[Array | None]
@@ -90,7 +90,7 @@ def walk(seed: int) -> Input:
     keypoints = [np.column_stack([p, np.ones((len(p), 2))]).astype(np.float32) for p in xy]
     features = [Features(k, np.zeros((len(k), 128), np.uint8)) for k in keypoints]
     held = LruSequence(len(features), features.__getitem__, lambda f: f.nbytes, 1e9)
-    views = Views(held, [k[:, :2].astype(float) for k in keypoints], np.arange(len(xy)) * 10.0, [])
+    views = KeyframeSet(held, [k[:, :2].astype(float) for k in keypoints], np.arange(len(xy)) * 10.0, [])
     return Input(views, pairs, camera, list(np.linalg.inv(poses)), focal, k1)
 
 
@@ -176,7 +176,7 @@ def recorded(name: str, work: Path) -> tuple[Input, Adjusted | None]:
     got: list[Any] = []
     plain, plain_run = StructureFromMotion._calibrated, StructureFromMotion.run
 
-    def calibrated(self: StructureFromMotion, views: Views, pairs: Any) -> Adjusted | None:
+    def calibrated(self: StructureFromMotion, views: KeyframeSet, pairs: Any) -> Adjusted | None:
         found = plain(self, views, pairs)
         got[1:] = [views, list(pairs), self.camera, found]
         return found

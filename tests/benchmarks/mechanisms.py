@@ -75,11 +75,13 @@ MECHANISMS = {
     ),
     "bridges": Mechanism(sfm, "weakly_connected", lambda *_: [], lambda weak, _: bool(weak)),
     "mending of size": Mechanism(
-        candidates, "mended", lambda model, report, *_: (model, report), lambda out, a: out[0] is not a[0]
+        candidates, "repair_scale_breaks", lambda model, report, *_: (model, report), lambda out, a: out[0] is not a[0]
     ),
-    "unfolding": Mechanism(candidates.Candidates, "_unfolded", lambda *_: None, lambda found, _: found is not None),
-    "closing": Mechanism(candidates.Candidates, "_closed", _same(1), lambda out, a: out is not a[1]),
-    "growing": Mechanism(candidates.Candidates, "_grown", _same(1), lambda out, a: out is not a[1]),
+    "unfolding": Mechanism(
+        candidates.Candidates, "_remap_from_neighbours", lambda *_: None, lambda found, _: found is not None
+    ),
+    "closing": Mechanism(candidates.Candidates, "_close_loops", _same(1), lambda out, a: out is not a[1]),
+    "growing": Mechanism(candidates.Candidates, "_register_remaining", _same(1), lambda out, a: out is not a[1]),
     "readout": Mechanism(candidates, "adjust_rolling", lambda *_: None, lambda out, _: out is not None),
     "freeing": Mechanism(candidates.Candidates, "_freed", lambda *_: None, lambda found, _: found is not None),
     "pieces": Mechanism(sfm.StructureFromMotion, "_pieces", lambda *_: [], lambda found, _: bool(found)),

@@ -174,7 +174,7 @@ def test_two_shards_write_the_table_at_the_same_moment(tmp_path: Path, monkeypat
         if not others:
             others.append(temporary)
             with monkeypatch.context() as other:
-                other.setattr(atomic, "process_mark", lambda: "of the other")
+                other.setattr(atomic, "process_token", lambda: "of the other")
                 batch.write_table(tmp_path, [{"recording": "b", "state": DONE}])
         replace(temporary, path)
 

@@ -90,8 +90,8 @@ def test_what_a_signal_ends(number: signal.Signals, copied_run: Callable[[str], 
 def test_what_libraries_children_and_faults_print(to_file: bool, tmp_path: Path) -> None:
     code = """
 import os, subprocess, sys
-from msgs_slam.msgs_cli.json_lines import only_json, write_line
-with only_json():
+from msgs_slam.msgs_cli.json_lines import json_stderr, write_line
+with json_stderr():
     os.write(2, b"INFO: of a library\\nhalf a ")
     os.write(2, b"line\\r 50%\\rbar\\n")
     subprocess.run([sys.executable, "-c", "import sys; print('of a child', file=sys.stderr)"])

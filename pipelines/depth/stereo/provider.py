@@ -19,7 +19,7 @@ from ....formats.errors import InputError
 from ...geometry.sparse_model import SparseModel
 from ...geometry.voxels import to_lab
 from ...providers import DepthEstimate, Sequence, resize_area
-from ...system.parallel import Kept, abreast
+from ...system.parallel import LruCache, map_lookahead
 from ...system.progress import Progress
 from ...system.values import load_value, save_value
 from ...types import Frame, Intrinsics
@@ -88,13 +88,15 @@ class MultiviewDepth:
         self._frame = {f.id: f for f in sequence.frames}
         self._bands, self._threads, self._device = Bands(threads), threads if device == "cpu" else 1, device
         self._camera: Intrinsics = sequence.calibration.intrinsics.at_most(side)
-        self._grey = Kept(self._read_grey, _CACHED_FRAMES)
-        self._raw = Kept(self._load_raw, _CACHED_FRAMES)
-        self._fused = Kept(self._fuse, _CACHED_FRAMES)
-        self._small = Kept(self._read_small, _CACHED_FRAMES)
-        self._contrast = Kept(self._measure_contrast, _CACHED_LENDERS)
-        self._lab: Kept[int, NDArray[np.float32]] = Kept(lambda index: to_lab(self._small(index)), _CACHED_LENDERS)
-        self._nearest = Kept(self._choose_nearest, _CACHED_FRAMES)
+        self._grey = LruCache(self._read_grey, _CACHED_FRAMES)
+        self._raw = LruCache(self._load_raw, _CACHED_FRAMES)
+        self._fused = LruCache(self._fuse, _CACHED_FRAMES)
+        self._small = LruCache(self._read_small, _CACHED_FRAMES)
+        self._contrast = LruCache(self._measure_contrast, _CACHED_LENDERS)
+        self._lab: LruCache[int, NDArray[np.float32]] = LruCache(
+            lambda index: to_lab(self._small(index)), _CACHED_LENDERS
+        )
+        self._nearest = LruCache(self._choose_nearest, _CACHED_FRAMES)
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames that are no keyframes of the backbone."""
@@ -109,7 +111,7 @@ class MultiviewDepth:
     def precompute(self, frames: list[Frame]) -> None:
         """A raw depth map of every keyframe, on disk."""
         known = [f for f in frames if f.id in self._index]
-        for _ in self._progress.track(abreast(self._look_at, known, self._threads), "stereo", len(known)):
+        for _ in self._progress.track(map_lookahead(self._look_at, known, self._threads), "stereo", len(known)):
             pass
 
     def _look_at(self, frame: Frame) -> None:

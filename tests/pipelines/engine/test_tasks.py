@@ -162,7 +162,7 @@ def test_two_that_end_the_same_task_without_locks_do_not_disturb_each_other(
         if not others and path == board.done(0):
             others.append(temporary)
             with monkeypatch.context() as other:
-                other.setattr(atomic, "process_mark", lambda: "of the other")
+                other.setattr(atomic, "process_token", lambda: "of the other")
                 board._do_locked(0, board._header(), engine_calls.silent)
         replace(temporary, path)
 

@@ -9,7 +9,7 @@ import pytest
 
 from msgs_slam.formats.gaussians import isotropic_cloud
 from msgs_slam.formats.ply import write_gaussian_ply
-from msgs_slam.pipelines.viewer.door import is_welcome
+from msgs_slam.pipelines.viewer.door import is_same_origin
 
 pytest.importorskip("viser")
 
@@ -76,7 +76,7 @@ def test_names_reach_the_page_without_markup(viewer: Any) -> None:
 
 
 def test_a_name_of_this_machine_or_an_address_is_welcome_where_it_was_asked_to_serve() -> None:
-    assert is_welcome("192.168.0.7:8080", "http://192.168.0.7:8080", "0.0.0.0")
-    assert is_welcome("[::1]:8080", "http://[::1]:8080", "::1")
-    assert is_welcome("lab.example:8080", "http://lab.example:8080", "lab.example")
-    assert not is_welcome("lab.example:8080", "http://lab.example:8080", "0.0.0.0")
+    assert is_same_origin("192.168.0.7:8080", "http://192.168.0.7:8080", "0.0.0.0")
+    assert is_same_origin("[::1]:8080", "http://[::1]:8080", "::1")
+    assert is_same_origin("lab.example:8080", "http://lab.example:8080", "lab.example")
+    assert not is_same_origin("lab.example:8080", "http://lab.example:8080", "0.0.0.0")

@@ -17,7 +17,7 @@ from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.files import BACKBONE, FRAMES, MAP, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import NotedProgress, locked
+from msgs_slam.pipelines.run.lock import ProgressFile, locked
 from msgs_slam.pipelines.system.progress import BEGUN, SilentProgress, StageEvent
 from msgs_slam.pipelines.viewer import live
 from msgs_slam.pipelines.viewer.live import standing
@@ -73,7 +73,7 @@ def test_a_line_says_what_is_shown_and_what_is_to_come(run: RunFolder) -> None:
         "Shown: cameras and points after frames (2 of 6 stages done). Still to come: tracking, mapping"
     )
     assert line.endswith(f"No job is running: `msgs-slam resume {run.root.name}` goes on.")
-    with locked(run), NotedProgress(SilentProgress(), run) as progress:
+    with locked(run), ProgressFile(SilentProgress(), run) as progress:
         progress.stage(StageEvent("tracking", 3, 6, BEGUN))
         assert standing(run).endswith("Still to come: tracking (running), mapping, global_ba, export.")
     note_finished(run, STAGES[:4])

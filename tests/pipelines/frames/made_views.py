@@ -12,7 +12,7 @@ from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.sfm.bridges import Picture
-from msgs_slam.pipelines.sfm.candidates import Views
+from msgs_slam.pipelines.sfm.candidates import KeyframeSet
 from msgs_slam.pipelines.sfm.driver import StructureFromMotion
 from msgs_slam.pipelines.sfm.matching import VerifiedPair, verify_matches
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
@@ -48,11 +48,11 @@ class MadeViews:
                     found.append(pair)
         return found
 
-    def views(self, given: Array | None = None) -> Views:
+    def views(self, given: Array | None = None) -> KeyframeSet:
         """As structure from motion has them, with poses (N, 4, 4) by another program."""
         streamed = LruSequence(len(self.features), self.features.__getitem__, lambda f: f.nbytes, 1e9)
         times = np.arange(len(self.features), dtype=float)
-        return Views(streamed, [f.xy for f in self.features], 10 * times, [], given)
+        return KeyframeSet(streamed, [f.xy for f in self.features], 10 * times, [], given)
 
     def off(self, model: pycolmap.Reconstruction) -> float:
         """Metres by which the model's worst camera is off after a similarity."""

@@ -13,7 +13,7 @@ from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.run.files import GIVEN_POSES
-from msgs_slam.pipelines.sfm.candidates import GIVEN, _worth
+from msgs_slam.pipelines.sfm.candidates import GIVEN, _selection_score
 from msgs_slam.pipelines.sfm.consistency import ModelReport
 from msgs_slam.pipelines.sfm.given import agreement, posed_model
 from msgs_slam.pipelines.sfm.lens import to_pycolmap, unknown_camera
@@ -62,9 +62,9 @@ def test_poses_that_are_far_off_make_a_model_as_good_as_none(is_known: bool, tmp
     assert model is not None
     structure = structure_of(made, camera, tmp_path, is_fixed=is_known, given=given)
     views = made.views(given)
-    found = structure._tried(GIVEN, views, pairs, pairs)
+    found = structure._build_model(GIVEN, views, pairs, pairs)
     assert found is not None
-    grown = structure._grown(found, views, pairs, pairs)
+    grown = structure._register_remaining(found, views, pairs, pairs)
     assert grown[0].num_reg_images() == 20
     assert made.off(grown[0]) < (0.02 if is_known else 0.03)
 
@@ -74,9 +74,9 @@ def test_images_that_match_nothing_do_not_stop_the_model_from_growing(tmp_path: 
     given = disturbed(made.cam_from_world)
     pairs = [p for p in made.pairs(CAMERA) if not {p.first, p.second} & blank]
     structure, views = structure_of(made, CAMERA, tmp_path, given=given), made.views(given)
-    found = structure._tried(GIVEN, views, pairs, pairs)
+    found = structure._build_model(GIVEN, views, pairs, pairs)
     assert found is not None
-    grown = structure._grown(found, views, pairs, pairs)[0]
+    grown = structure._register_remaining(found, views, pairs, pairs)[0]
     assert {i - 1 for i in grown.reg_image_ids()} == set(range(20)) - blank
 
 
@@ -87,7 +87,7 @@ def test_given_poses_decide_between_models_that_the_matches_do_not(agreement: fl
         (model, "neighbours", ModelReport(9, 9, 500, 0.3, 0.7, 0.7, (), both)),
         (model, GIVEN, ModelReport(9, 9, 500, 0.3, agreement, 0.7, (), both)),
     ]
-    assert max(tried, key=_worth)[1] == wanted
+    assert max(tried, key=_selection_score)[1] == wanted
 
 
 def test_given_poses_cost_nothing_where_the_pictures_are_enough(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.sfm.bridges import Picture
-from msgs_slam.pipelines.sfm.candidates import Views
+from msgs_slam.pipelines.sfm.candidates import KeyframeSet
 from msgs_slam.pipelines.sfm.driver import StructureFromMotion
 from msgs_slam.pipelines.sfm.lens import unknown_camera
 from msgs_slam.pipelines.sfm.matching import VerifiedPair, verify_matches
@@ -88,8 +88,8 @@ def test_sides_that_look_alike_do_not_fold_the_path(tmp_path: Path, monkeypatch:
         progress=SilentProgress(), threads=1, seed=0,
     )  # fmt: skip
     streamed = LruSequence(VIEWS, features.__getitem__, lambda f: f.nbytes, 1e9)
-    given = Views(streamed, [f.xy for f in features], np.arange(VIEWS, dtype=float), [])
-    folded = structure._tried("global", given, pairs, pairs)
+    given = KeyframeSet(streamed, [f.xy for f in features], np.arange(VIEWS, dtype=float), [])
+    folded = structure._build_model("global", given, pairs, pairs)
     found = structure._map(given, pairs)
     assert folded is not None
     assert found is not None

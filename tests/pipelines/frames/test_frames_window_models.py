@@ -10,7 +10,7 @@ import pytest
 
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.sfm.bundle import Bundle
-from msgs_slam.pipelines.sfm.candidates import Adjusted, Views
+from msgs_slam.pipelines.sfm.candidates import Adjusted, KeyframeSet
 from msgs_slam.pipelines.sfm.driver import StructureFromMotion
 from msgs_slam.pipelines.sfm.rolling import NO_READOUT, Readout
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
@@ -50,7 +50,7 @@ def in_windows(
         threads=1, seed=0, extract=lambda _: None, picture=lambda _: None, time=float,
         match=lambda *_: None, warn=warned.append,
     )  # type: ignore[arg-type, return-value] # fmt: skip
-    return *structure._in_windows(WINDOWS, Views(nothing, xy, TIMES, []), []), warned
+    return *structure._in_windows(WINDOWS, KeyframeSet(nothing, xy, TIMES, []), []), warned
 
 
 def test_the_readout_is_that_of_all_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

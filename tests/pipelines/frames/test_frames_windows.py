@@ -22,7 +22,7 @@ from msgs_slam.pipelines.sfm.consistency import judge
 from msgs_slam.pipelines.sfm.lens import unknown_camera
 from msgs_slam.pipelines.sfm.matching import VerifiedPair
 from msgs_slam.pipelines.sfm.rolling import NO_READOUT
-from msgs_slam.pipelines.sfm.scale_repair import mended, resize_behind, size_ratio
+from msgs_slam.pipelines.sfm.scale_repair import repair_scale_breaks, rescale_after, scale_ratio
 from msgs_slam.pipelines.sfm.windows import WIDE, Joined, adjust_together, close_loops
 from msgs_slam.pipelines.system.memory import WINDOW, WINDOW_OVERLAP, window_size, windows_of
 from msgs_slam.pipelines.types import Calibration, Intrinsics
@@ -174,7 +174,7 @@ def torn(at: int, ratio: float) -> tuple[pycolmap.Reconstruction, list[Array], l
     """The walk in two structures that share one keyframe, and no point; what lies behind it is larger by a ratio."""
     model, xy = model_of(range(COUNT), moves()[0], 0.0)
     pairs = matched(xy, [np.array([p for p, _ in view]) for view in seen()[1]])
-    resize_behind(model, at, ratio)
+    rescale_after(model, at, ratio)
     for point in sorted(model.point3D_ids()):
         elements = [(e.image_id, e.point2D_idx) for e in model.points3D[point].track.elements]
         behind = np.mean([np.sign(i - 1 - at) for i, _ in elements]) > 0
@@ -189,10 +189,10 @@ def test_a_path_that_lost_its_size_is_mended_by_what_matches(ratio: float) -> No
     model, xy, pairs = torn(20, ratio)
     report = judge(model, pairs, xy, COUNT, 4)
     assert sorted(len(p) for p in report.parts) in ([20, 20], [19, 21])  # the shared keyframe goes with either
-    found, count = size_ratio(model, 20, pairs, xy, 4)
+    found, count = scale_ratio(model, 20, pairs, xy, 4)
     assert found == pytest.approx(1 / ratio, rel=0.02)
     assert count > 100
-    whole, better = mended(model, report, pairs, xy, COUNT, 4, 0)
+    whole, better = repair_scale_breaks(model, report, pairs, xy, COUNT, 4, 0)
     assert [len(p) for p in better.parts] == [COUNT]
     centers = np.array([whole.images[i].projection_center() for i in range(1, COUNT + 1)])
     wanted = se3.inverse(path())[:, :3, 3]
@@ -203,7 +203,7 @@ def test_a_path_that_nothing_holds_stays_in_parts() -> None:
     model, xy, pairs = torn(20, 3.0)
     apart = [p for p in pairs if (p.first <= 20) == (p.second <= 20)]
     report = judge(model, apart, xy, COUNT, 4)
-    left, same = mended(model, report, apart, xy, COUNT, 4, 0)
+    left, same = repair_scale_breaks(model, report, apart, xy, COUNT, 4, 0)
     assert left is model
     assert same is report
     assert len(report.parts) > 1

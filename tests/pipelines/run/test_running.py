@@ -13,7 +13,7 @@ from msgs_slam.pipelines.config import STAGES, Config
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.run import ending, lock
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import PROGRESS, Running, is_led, load_running, locked
+from msgs_slam.pipelines.run.lock import PROGRESS, RunProgress, is_led, load_run_progress, locked
 from msgs_slam.pipelines.status import run_status
 from msgs_slam.pipelines.system.progress import SilentProgress
 
@@ -73,7 +73,7 @@ def test_what_a_killed_process_has_noted_does_not_run(seen: States, source: Path
     (run.root / PROGRESS).write_text('{"stage": "proxy", "label": "depth", "done": 3, "of": 4, "left": 240.0}')
     assert [s.state_text for s in run_status(run).stages[:2]] == ["done", "interrupted"]
     with locked(run):
-        assert load_running(run) == Running("proxy", "depth", 3, 4, 240.0)
+        assert load_run_progress(run) == RunProgress("proxy", "depth", 3, 4, 240.0)
         assert run_status(run).stages[1].state_text == "running, depth 75 %, about 4 min left"
         (run.root / PROGRESS).write_text("{")
         assert run_status(run).stages[1].state == "interrupted"

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from msgs_slam.pipelines.system.parallel import ABREAST, Kept, abreast, parallel_map
+from msgs_slam.pipelines.system.parallel import LOOKAHEAD, LruCache, map_lookahead, parallel_map
 
 
 class Crowd:
@@ -26,7 +26,7 @@ class Crowd:
         return item * item
 
 
-@pytest.mark.parametrize("map_", [parallel_map, abreast])
+@pytest.mark.parametrize("map_", [parallel_map, map_lookahead])
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_results_come_in_order(map_, threads: int) -> None:  # type: ignore[no-untyped-def]
     assert list(map_(lambda x: x * x, range(9), threads)) == [x * x for x in range(9)]
@@ -34,9 +34,9 @@ def test_results_come_in_order(map_, threads: int) -> None:  # type: ignore[no-u
 
 
 def test_two_are_in_work_at_once_and_no_more() -> None:
-    crowd = Crowd(ABREAST)
-    assert list(abreast(crowd, range(8), threads=16)) == [x * x for x in range(8)]
-    assert crowd.most == ABREAST
+    crowd = Crowd(LOOKAHEAD)
+    assert list(map_lookahead(crowd, range(8), threads=16)) == [x * x for x in range(8)]
+    assert crowd.most == LOOKAHEAD
 
 
 def test_with_one_thread_each_is_done_when_it_is_asked_for() -> None:
@@ -47,12 +47,12 @@ def test_with_one_thread_each_is_done_when_it_is_asked_for() -> None:
             begun.append(item)
             yield item
 
-    results = abreast(lambda x: x, items(), threads=1)
+    results = map_lookahead(lambda x: x, items(), threads=1)
     assert next(results) == 0
     assert begun == [0]
 
 
-@pytest.mark.parametrize("map_", [parallel_map, abreast])
+@pytest.mark.parametrize("map_", [parallel_map, map_lookahead])
 def test_an_error_comes_in_its_place(map_) -> None:  # type: ignore[no-untyped-def]
     results = map_(lambda x: 1 // (x - 2), range(5), 2)
     assert [next(results), next(results)] == [-1, -1]
@@ -68,7 +68,7 @@ def test_what_two_threads_ask_for_is_made_once() -> None:
         made.append(key)
         return -key
 
-    kept = Kept(make, 4)
+    kept = LruCache(make, 4)
 
     def ask(_: int) -> list[int]:
         both.wait(5)
@@ -81,7 +81,7 @@ def test_what_two_threads_ask_for_is_made_once() -> None:
 
 def test_those_asked_for_last_are_kept() -> None:
     made: list[int] = []
-    kept = Kept(lambda key: made.append(key) or key, 2)
+    kept = LruCache(lambda key: made.append(key) or key, 2)
     for key in (1, 2, 1, 3, 1, 2):
         assert kept(key) == key
     assert made == [1, 2, 3, 2]
@@ -95,7 +95,7 @@ def test_what_could_not_be_made_is_tried_again() -> None:
             raise answer
         return answer
 
-    kept = Kept(make, 2)
+    kept = LruCache(make, 2)
     with pytest.raises(ValueError, match="not yet"):
         kept(1)
     assert [kept(1), kept(1)] == [7, 7]

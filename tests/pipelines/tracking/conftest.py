@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.images import write_rgb
+from msgs_slam.formats.images import to_grey, write_rgb
 from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import StageContext
@@ -18,7 +18,6 @@ from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, CLASSES, PROXY_MAPS, save_frames
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.sfm.bundle import Bundle
-from msgs_slam.pipelines.sfm.features import to_grey
 from msgs_slam.pipelines.sfm.flow import corners
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, ClassTable, Frame, Intrinsics, ProxyMaps

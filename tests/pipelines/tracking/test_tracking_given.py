@@ -15,7 +15,7 @@ from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import BACKBONE, FIGURES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
-from msgs_slam.pipelines.tracking.segments import lose_unfit, pose_lost
+from msgs_slam.pipelines.tracking.segments import drop_inconsistent_segments, pose_lost
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import GivenPoses
 from tests.matrices import write_matrices
@@ -109,7 +109,7 @@ def test_a_short_stretch_that_does_not_fit_leaves_the_path_to_the_given_poses() 
     given[5::10] = np.nan
     given[20, :3, 3] += 30.0
     state = stretch_at(range(8, 13), se3.exp(np.random.default_rng(0).normal(size=(40, 6))))
-    lose_unfit(state, GivenPoses(given, True, "made up"))
+    drop_inconsistent_segments(state, GivenPoses(given, True, "made up"))
     carried = pose_lost(state, GivenPoses(given, True, "made up"))
     assert sorted(state.lost) == [5, 15, 20, 25, 35]
     np.testing.assert_allclose([state.poses[i] for i in carried], true[carried], atol=1e-9)
@@ -122,14 +122,14 @@ def test_a_stretch_that_the_given_poses_could_not_replace_stays(frames: range, k
     given[known] = true[known]
     found = se3.exp(np.random.default_rng(0).normal(size=(40, 6)))
     state = stretch_at(frames, found)
-    lose_unfit(state, GivenPoses(given, True, "made up"))
+    drop_inconsistent_segments(state, GivenPoses(given, True, "made up"))
     assert sorted(state.poses) == list(frames)
 
 
 def test_a_stretch_that_fits_is_never_left() -> None:
     true = walked(40)
     state = stretch_at(range(5, 15), true)
-    lose_unfit(state, GivenPoses(true, True, "made up"))
+    drop_inconsistent_segments(state, GivenPoses(true, True, "made up"))
     assert pose_lost(state, GivenPoses(true, True, "made up")) == [*range(5), *range(15, 40)]
     np.testing.assert_allclose([state.poses[i] for i in range(40)], true, atol=1e-9)
 

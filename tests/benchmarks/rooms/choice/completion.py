@@ -11,7 +11,7 @@ from msgs_slam.pipelines.depth.stereo.sweep import warps_to
 from msgs_slam.pipelines.depth.stereo.upsample import upsample_depth
 from msgs_slam.pipelines.geometry.voxels import to_lab
 from msgs_slam.pipelines.providers import DepthEstimate, resize_area
-from msgs_slam.pipelines.system.parallel import Kept
+from msgs_slam.pipelines.system.parallel import LruCache
 
 from .candidates import Candidates, Known, find_candidates, find_planes
 from .evidence import View, gather_evidence
@@ -112,7 +112,7 @@ class Completion:
     def __init__(self, provider: MultiviewDepth, model: ChoiceModel | None = None) -> None:
         """Without a model there are only cases."""
         self._of, self._model = provider, model
-        self._half = Kept(self._halve, _LENDERS + 4)
+        self._half = LruCache(self._halve, _LENDERS + 4)
 
     def case(self, index: int) -> Case | None:
         """What the completion of a keyframe rests on, by its index in the backbone; None with hardly a sure pixel."""
