@@ -34,7 +34,6 @@ def video(tmp_path: Path) -> Path:
         (["--format", "video"], "did you mean images?"),
         (["--camera", "fish-eye"], "--camera is one of auto, perspective, equirectangular, fisheye"),
         (["--set", "run.device=gpu"], "did you mean cuda?"),
-        (["--set", "frames.rat=3"], "did you mean frames.rate?"),
         (["--hold-out", "1"], "--hold-out is 2 to 1000000, or 0; got 1"),
         (["--devise", "cpu"], "--device"),
     ],
@@ -146,10 +145,3 @@ def test_signals_end_other_commands_without_a_stack_trace(
     assert "stack trace" not in errors
     assert "Traceback" not in errors
     assert ("stopped by Ctrl-C" in errors) == (number == signal.SIGINT)
-
-
-def test_status_tells_how_long_the_unit_is_and_gps() -> None:
-    from msgs_slam.msgs_cli.output import KEY_FIGURES
-
-    assert "metres_per_unit" in KEY_FIGURES["proxy"]
-    assert "gps" in KEY_FIGURES["frames"]

@@ -19,7 +19,6 @@ from msgs_slam.pipelines.reconstruct import made_with, reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
 from msgs_slam.pipelines.run.lock import locked
 from msgs_slam.pipelines.run.manifest import keyframe_psnr
-from msgs_slam.pipelines.source.opening import source_digest
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.system.wording import figure_text
 
@@ -124,16 +123,6 @@ def test_refused_setting_does_not_stick(
     assert invoke("reconstruct", finished_run.video, "--out", run, *option).exit_code == code
     assert {p: p.read_bytes() for p in before} == before
     assert invoke("resume", run, "-q").exit_code == 0
-
-
-def test_other_files_beside_the_pictures_are_not_the_source(tmp_path: Path, finished_run: FinishedRun) -> None:
-    folder = finished_run.truth / "rgb"
-    before = source_digest(folder, "images")
-    for name in (".DS_Store", "Thumbs.db", "notes.txt"):
-        (folder / name).write_text("x")
-    assert source_digest(folder, "images") == before
-    for name in (".DS_Store", "Thumbs.db", "notes.txt"):
-        (folder / name).unlink()
 
 
 def test_second_process_removes_nothing(tmp_path: Path, finished_run: FinishedRun) -> None:

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from msgs_slam.formats.images import to_grey
 from msgs_slam.pipelines.run.files import FEATURES, MATCHED_PAIRS, VOCABULARY
-from msgs_slam.pipelines.sfm.features import extract_features, to_grey
+from msgs_slam.pipelines.sfm.features import extract_features
 from msgs_slam.pipelines.sfm.retrieval import learn_vocabulary
 
 

@@ -1,7 +1,6 @@
 """Data sets as sources: what their readers know reaches the frames, the camera and the proxies."""
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -194,7 +193,7 @@ def test_pictures_beside_the_images_do_not_hide_a_project(
 
 
 def test_a_damaged_first_image_does_not_cost_the_set(short: Sequence, tmp_path: Path) -> None:
-    for layout in ("tum", "nerfstudio", "scannet", "colmap", "nice_slam"):
+    for layout in ("tum", "nerfstudio", "scannet", "colmap", "nice_slam", "seven_scenes"):
         path = LAYOUTS[layout][0](short, tmp_path / layout)
         first = open_sequence(path).image_paths[0]
         first.write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
@@ -225,16 +224,3 @@ def test_a_data_set_is_reconstructed_with_what_it_knows(truth: Sequence, tmp_pat
     # The same pictures under another name are another source.
     with pytest.raises(InputError, match="another source"):
         reconstruct(path / "rgb", run, replace(config, run=replace(config.run, format="images")), SilentProgress())
-
-
-@pytest.mark.parametrize("write", [tum, seven_scenes])
-def test_a_data_set_may_begin_with_a_damaged_image(
-    write: Callable[[Sequence, Path], Path], short: Sequence, tmp_path: Path
-) -> None:
-    source = open_source(write(short, tmp_path / "set"))
-    assert isinstance(source, RecordingSource)
-    source.sequence.image_paths[0].write_bytes(b"\x89PNG\r\n not really")
-    again, notes = open_source(tmp_path / "set"), []
-    assert (again.width, again.height) == (source.width, source.height)
-    assert len(list(again.read(warn=notes.append))) == 4
-    assert any(source.sequence.image_paths[0].name in note for note in notes)

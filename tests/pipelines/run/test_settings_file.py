@@ -10,7 +10,7 @@ from finished import note_finished
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config, ExportConfig
-from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings, load_source
+from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings
 
 
 @pytest.fixture
@@ -40,35 +40,9 @@ def test_a_setting_that_is_no_more_does_not_stop_a_run(run: RunFolder, caplog: p
     assert "there is no setting frames.rat; did you mean frames.rate?: it is ignored" in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "reason"),
-    [
-        ("voxel = 0.008", "voxel = 8", r"export\.voxel .*0\.0005 to 1.*Correct it, or delete it and run"),
-        ("voxel = 0.008", "voxel = ", "delete it and run `msgs-slam resume"),
-    ],
-)
-def test_a_value_that_cannot_be_and_a_file_cut_short_are_refused(
-    run: RunFolder, old: str, new: str, reason: str
-) -> None:
-    edit(run, old, new)
-    with pytest.raises(InputError, match=reason):
-        load_settings(RunFolder(run.root))
-    text = run.settings_file.read_text()
-    run.settings_file.write_text(text[: text.index("[export]")])
-    with pytest.raises(InputError, match="cut short"):
-        load_settings(RunFolder(run.root))
-    run.settings_file.write_text("")
-    with pytest.raises(InputError, match=r"run\.toml is empty"):
-        load_settings(RunFolder(run.root))
-
-
 def test_a_manifest_of_another_format_is_refused(run: RunFolder) -> None:
     value = json.loads(run.manifest_file.read_text())
     for format in (1, 99):
         run.manifest_file.write_text(json.dumps(value | {"format": format}))
         with pytest.raises(InputError, match=f"its format is {format}, this version of the program knows 2"):
             load_records(RunFolder(run.root))
-    for spoilt in (value | {"source": 5}, {"stages": {}}, value | {"stages": {"frames": []}}):
-        run.manifest_file.write_text(json.dumps(spoilt))
-        with pytest.raises(InputError, match="msgs-slam reconstruct"):
-            load_source(RunFolder(run.root))
