@@ -292,11 +292,7 @@ def export(
 @device_option
 @verbosity_options
 def demo(
-    out: Path,
-    config_file: Path | None,
-    overrides: tuple[str, ...],
-    output: Output,
-    **given: str | int | None,
+    out: Path, config_file: Path | None, overrides: tuple[str, ...], output: Output, **given: str | int | None
 ) -> None:
     """Reconstruct a synthetic test clip and print its errors against ground truth."""
     config = chosen_config(config_file, overrides, given)

@@ -18,6 +18,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
 VOID = 255
 """Label of a pixel whose class is unknown."""
 

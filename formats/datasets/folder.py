@@ -10,13 +10,7 @@ from ..image_folder import count_images, list_images
 from ..textfile import read_rows
 from ..trajectory import read_matrices, read_tum
 from .calibration import read_intrinsics_json
-from .matching import (
-    classes_found,
-    files_for_images,
-    poses_at,
-    poses_for_images,
-    times_or_frame_numbers,
-)
+from .matching import classes_found, files_for_images, poses_at, poses_for_images, times_or_frame_numbers
 from .sequence import Camera, LabelClass, Sequence, read_classes_json
 
 _IMAGE_FOLDERS = ("rgb", "images", "color", "frames")

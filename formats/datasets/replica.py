@@ -10,12 +10,7 @@ from ..image_folder import list_images
 from ..images import first_readable, image_size
 from ..trajectory import read_matrices
 from .calibration import read_intrinsics_json
-from .matching import (
-    classes_found,
-    files_for_images,
-    poses_for_images,
-    times_or_frame_numbers,
-)
+from .matching import classes_found, files_for_images, poses_for_images, times_or_frame_numbers
 from .sequence import Camera, LabelClass, Sequence, read_classes_json
 
 _CLASS_FOLDERS = ("semantic_class", "semantic_classes")

@@ -14,9 +14,7 @@ from ..geometry.tape import tape_text
 from ..outcome import Outcome
 from ..run.files import PROXY_MAPS
 from ..scene.world import WORLD
-from ..types import LoopEdge
-
-Array = NDArray[np.float64]
+from ..types import Array, LoopEdge
 
 _ENDS = (0.01, 0.99)
 """Quantiles of the solid Gaussians between which something is: beyond are floaters, and views through windows."""

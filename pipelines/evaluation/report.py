@@ -1,7 +1,5 @@
 """One HTML file about a run that opens anywhere, without a network."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path

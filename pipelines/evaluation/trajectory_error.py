@@ -9,9 +9,7 @@ from numpy.typing import NDArray
 
 from ..geometry import se3
 from ..geometry.se3 import Similarity, align_points
-from ..types import require_shape
-
-Array = NDArray[np.float64]
+from ..types import Array, require_shape
 
 
 @dataclass(frozen=True)

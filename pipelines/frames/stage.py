@@ -18,16 +18,7 @@ from ..engine.stages import StageContext
 from ..engine.tasks import in_chunks
 from ..geometry.camera import Rig, rig_of
 from ..run.extension import parent_of
-from ..run.files import (
-    BACKBONE,
-    CALIBRATION,
-    FEATURES,
-    GIVEN_POSES,
-    MATCHED_PAIRS,
-    SPARSE,
-    VOCABULARY,
-    save_frames,
-)
+from ..run.files import BACKBONE, CALIBRATION, FEATURES, GIVEN_POSES, MATCHED_PAIRS, SPARSE, VOCABULARY, save_frames
 from ..sfm.bridges import Picture
 from ..sfm.driver import Structure
 from ..sfm.lens import Lens, distortion_of, make_lens

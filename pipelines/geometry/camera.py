@@ -11,12 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import Intrinsics, ProxyMaps, require_shape
+from ..types import Array, Intrinsics, ProxyMaps, require_shape
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-Array = NDArray[np.float64]
 
 LEVEL = 4
 """The first so many sides look to the horizon."""

@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from ..types import Intrinsics
+from ..types import Array, Intrinsics
 from .camera import project, unproject
-
-Array = NDArray[np.float64]
 
 NEIGHBOURS = 16
 _MIN_OVERLAP = 0.2

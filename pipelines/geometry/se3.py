@@ -16,9 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..types import require_shape
-
-Array = NDArray[np.float64]
+from ..types import Array, require_shape
 
 ArrayT = TypeVar("ArrayT", Tensor, NDArray[np.float64])
 

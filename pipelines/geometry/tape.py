@@ -3,13 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...formats.gaussians import GaussianCloud
-from ..types import Metres
-
-Array = NDArray[np.float64]
+from ..types import Array, Metres
 
 _REACH = 3.0
 """Standard deviations from its middle at which a Gaussian still counts."""

@@ -35,9 +35,8 @@ from ..tracking.pictures import Pictures
 from ..tracking.pnp import FramePose, predict_pose
 from ..tracking.relocalise import group_by_points, recognise
 from ..tracking.state import FEATURE_SD, NO_SIGHTINGS, Sightings, TrackState
-from ..types import Features, Trajectory
+from ..types import Array, Features, Trajectory
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 _SNAPSHOT_EVERY = 200
 _BESIDE = 2

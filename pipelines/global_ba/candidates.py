@@ -14,9 +14,8 @@ from ..config import GlobalBaConfig
 from ..geometry.sparse_model import SparseModel
 from ..proxy.maps import mean_iou
 from ..sfm.retrieval import GlobalDescriptors, far_apart, loop_pairs
-from ..types import VOID
+from ..types import VOID, Array
 
-Array = NDArray[np.float64]
 GRID = (40, 30)
 
 GAP = 8
@@ -64,9 +63,7 @@ def loop_candidates(
 
 
 def _semantic_candidates(
-    unrelated: Callable[[slice], NDArray[np.bool_]],
-    looks: GlobalDescriptors,
-    summaries: Sequence[LabelSummary],
+    unrelated: Callable[[slice], NDArray[np.bool_]], looks: GlobalDescriptors, summaries: Sequence[LabelSummary]
 ) -> set[tuple[int, int]]:
     out: set[tuple[int, int]] = set()
     for i in np.flatnonzero(richness(summaries) > RICH).tolist():

@@ -15,10 +15,8 @@ from ..geometry import se3
 from ..sfm.bundle import reprojection_errors
 from ..tracking.adjust import LoadProxy, Report, adjust_state
 from ..tracking.state import Sightings, TrackState
-from ..types import Intrinsics
+from ..types import Array, Intrinsics
 from .loops import Loop
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

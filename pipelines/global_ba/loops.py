@@ -13,7 +13,7 @@ from ..geometry.camera import unproject
 from ..sfm.matching import match_descriptors
 from ..tracking.pnp import FramePose, solve_pose
 from ..tracking.state import Sightings
-from ..types import Features, Intrinsics, LoopEdge
+from ..types import Array, Features, Intrinsics, LoopEdge
 
 ERROR = 4.0
 """Pixels within which a feature agrees with a loop."""
@@ -21,8 +21,6 @@ INLIERS, SHARE = 25, 0.3
 """Least number and share of agreeing features, in both directions."""
 ROTATION, TRANSLATION = 2.0, 0.05
 """By how much a loop's two directions may differ: degrees, and distance in units of the median depth."""
-
-Array = NDArray[np.float64]
 
 AGREEMENT = 3.0
 """Times the tolerance of one measurement, within which a neighbouring loop agrees: there are two measurements, and the

@@ -36,13 +36,11 @@ from ..system.values import load_value, save_value
 from ..tracking.adjust import align_depths, without_dependent_depth
 from ..tracking.pictures import Pictures, load_shutter
 from ..tracking.state import FEATURE_SD, TrackState, to_sparse_model
-from ..types import VOID, Intrinsics, Trajectory
+from ..types import VOID, Array, Intrinsics, Trajectory
 from .between import pose_every_frame
 from .candidates import LabelSummary, loop_candidates, summarise_labels
 from .close import Closed, close_loops
 from .loops import FoundLoops, KeyframeView, Loop, find_loops, make_view
-
-Array = NDArray[np.float64]
 
 DRIFT_PX = 6.0
 """A loop that is off by more pixels starts a pose graph."""

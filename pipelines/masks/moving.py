@@ -127,10 +127,7 @@ def _witnesses(poses: NDArray[np.float64], k: int, depth: float) -> list[int]:
 
 
 def _evidence(
-    view: MovingView,
-    witnesses: Iterator[tuple[MovingView, NDArray[np.bool_] | None]],
-    camera: Intrinsics,
-    rules: Rules,
+    view: MovingView, witnesses: Iterator[tuple[MovingView, NDArray[np.bool_] | None]], camera: Intrinsics, rules: Rules
 ) -> NDArray[np.bool_]:
     """(h, w) where more witnesses, each with what of it moved (h, w), say that another colour belongs there than this
     one."""

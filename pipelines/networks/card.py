@@ -32,8 +32,6 @@ background = ["object", "things", "stuff", "texture"]    # what fits these bette
 temperature = 0.01                # of the softmax over cosines
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path

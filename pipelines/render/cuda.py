@@ -40,11 +40,7 @@ def composite(
 
 
 def composite_records(
-    records: Tensor,
-    features: Tensor,
-    width: int,
-    height: int,
-    tiles: tuple[Tensor, Tensor] | None = None,
+    records: Tensor, features: Tensor, width: int, height: int, tiles: tuple[Tensor, Tensor] | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The same of the Gaussians' records (M, 6); `tiles`: what `list_tiles` says of them, where that is known."""
     if features.dtype != torch.float32:

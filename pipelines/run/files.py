@@ -29,13 +29,7 @@ from ..types import (
     Trajectory,
     Vocabulary,
 )
-from .schema import (
-    RunFile,
-    dataclass_from_json,
-    require_increasing,
-    require_indices,
-    require_rigid,
-)
+from .schema import RunFile, dataclass_from_json, require_increasing, require_indices, require_rigid
 
 if TYPE_CHECKING:
     from ..depth.fields import DepthFields

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..networks.card import Card
 from ..networks.depth import network_depth
 from ..networks.session import Letterbox, Network
-from ..types import Intrinsics
+from ..types import Array, Intrinsics
 from .evidence import Evidence, Mode
 from .view import MIN_CONFIDENCE, SeenFrame
 
@@ -23,8 +23,6 @@ _SENSOR_SPREAD = 0.02
 _MIN_SD = 0.003
 MEASURED = "measured"
 """Kind of what somebody has measured: a length that the user knows, a depth camera."""
-
-Array = NDArray[np.float64]
 
 SMALL_SD = 0.25
 """FastDepth puts 77.1 % of the pixels of NYU Depth v2 within 25 % of the truth (Wofk et al., ICRA 2019): a Gaussian of

@@ -19,7 +19,7 @@ from ..geometry.voxels import VOXELS_PER_DEPTH, Voxels, gather_depths
 from ..mapping.measure import depth_view
 from ..outcome import Outcome, maps_around, spread_sample
 from ..system.parallel import map_lookahead, parallel_map
-from ..types import Intrinsics
+from ..types import Array, Intrinsics
 
 _MIN_LENGTH = 0.05
 """Shorter segments, as a share of the image's long side, have no reliable direction."""
@@ -32,8 +32,6 @@ _SDS = (2.0, 1.0, 0.7, 0.5, 0.5, 0.5)
 _INSIDE = 1.0
 _MIN_LINES = 40
 _MIN_CONTRAST = 3.0
-
-Array = NDArray[np.float64]
 
 _PICTURES, _VIEWS = 40, 24
 _SIDE = 200

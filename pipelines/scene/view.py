@@ -11,9 +11,7 @@ from ..geometry.camera import resize_maps, unproject_depth
 from ..geometry.room_layout import CEILING, FLOOR, FloorPlane, Gravity, find_gravity, floor_plane, name_structure
 from ..geometry.voxels import MIN_WEIGHT, VOXELS_PER_DEPTH, Voxels, find, gather_frame, merge, voxel_keys
 from ..providers import resize_area
-from ..types import VOID, Intrinsics, ProxyMaps
-
-Array = NDArray[np.float64]
+from ..types import VOID, Array, Intrinsics, ProxyMaps
 
 MIN_CONFIDENCE = 0.3
 _SIDE = 200

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..system.parallel import LruSequence
-from ..types import Features
+from ..types import Array, Features
 from .flow import corners, follow
 from .matching import VerifiedPair
 from .snapshots import Snapshots, features_name, pairs_name
@@ -26,7 +26,6 @@ _MAX_CORNERS, _DISTANCE = 1000, 3.0
 _MIN_GUESS, _GUESS_ERROR = 8, 0.03
 """Matches for a first guess of where corners go, a homography, and their error, as a share of the image's width."""
 
-Array = NDArray[np.float64]
 Picture = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
 """(H, W) grey, and what is left out of it."""
 

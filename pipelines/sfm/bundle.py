@@ -18,10 +18,8 @@ from scipy.sparse.linalg import splu
 
 from ..geometry import se3
 from ..geometry.camera import ONE_CAMERA, Rig, project, tie_cameras
-from ..types import Intrinsics, require_shape
+from ..types import Array, Intrinsics, require_shape
 from . import bundle_kernels as kernels
-
-Array = NDArray[np.float64]
 
 DENSE_CAMERAS = 250
 """Up to so many a dense factorisation of the reduced system is faster than a sparse one."""

@@ -173,10 +173,7 @@ class Candidates:
         return Adjusted(model, mapper, adjust(model, not self.is_fixed, bool(views.weak)), report.score, NO_READOUT)
 
     def _map(
-        self,
-        views: KeyframeSet,
-        pairs: Sequence[VerifiedPair],
-        mappers: Sequence[str] = ("global", "incremental"),
+        self, views: KeyframeSet, pairs: Sequence[VerifiedPair], mappers: Sequence[str] = ("global", "incremental")
     ) -> _ScoredModel | None:
         """The best of the mappers' models, None where none is any; the next is only made when those before it are
         doubtful."""

@@ -23,10 +23,7 @@ _SUPPORT = 2.0
 
 
 def extract_features(
-    grey: NDArray[np.uint8],
-    count: int,
-    left_out: NDArray[np.bool_] | None = None,
-    threshold: float = PEAK_THRESHOLD,
+    grey: NDArray[np.uint8], count: int, left_out: NDArray[np.bool_] | None = None, threshold: float = PEAK_THRESHOLD
 ) -> Features:
     """SIFT features (Lowe 2004) of an (H, W) image, at most about `count`, as RootSIFT (Arandjelović and Zisserman,
     CVPR 2012).

@@ -58,11 +58,7 @@ def _flow(
 
 
 def corners(
-    grey: NDArray[np.uint8],
-    taken: Array,
-    count: int,
-    distance: float = 10.0,
-    left_out: NDArray[np.bool_] | None = None,
+    grey: NDArray[np.uint8], taken: Array, count: int, distance: float = 10.0, left_out: NDArray[np.bool_] | None = None
 ) -> Array:
     """Up to `count` new corners (Q, 2), subpixel, none within `distance` pixels of those taken (R, 2) or each other,
     and none in a mask (H, W)."""

@@ -33,10 +33,7 @@ def require_motion(largest_displacement: float) -> None:
 
 
 def require_parallax(
-    pairs: Sequence[VerifiedPair],
-    xy: Sequence[NDArray[np.float64]],
-    size: tuple[int, int],
-    focal: float | None,
+    pairs: Sequence[VerifiedPair], xy: Sequence[NDArray[np.float64]], size: tuple[int, int], focal: float | None
 ) -> None:
     """Raise InputError when turning on the spot explains all matches; size = (width, height).
 

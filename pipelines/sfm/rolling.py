@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from ...formats.colmap import ModelArrays
 from ...formats.errors import InputError
 from ..geometry import se3
-from ..types import Intrinsics
+from ..types import Array, Intrinsics
 from . import bundle_kernels as kernels
 from .adjust import LOSS_SD, adjust, solve
 from .bundle import Bundle, Problem
 
-Array = NDArray[np.float64]
 Readout = tuple[float, float]
 """Seconds by which the right and the lower border of a frame are taken later than the left and the upper one. Sensors
 read row by row; of a video that was filmed upright and turned these are columns."""

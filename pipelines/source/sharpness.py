@@ -47,9 +47,7 @@ def reduce_image(image: NDArray[np.uint8], max_side: int) -> NDArray[np.uint8]:
 
 
 def sharpest_of_windows(
-    pictures: Iterable[VideoFrame],
-    rate: float,
-    measure: Callable[[NDArray[np.uint8]], float] = sharpness,
+    pictures: Iterable[VideoFrame], rate: float, measure: Callable[[NDArray[np.uint8]], float] = sharpness
 ) -> Iterator[tuple[VideoFrame, float]]:
     """The sharpest image of every 1/rate seconds, with its sharpness; rate 0 keeps all.
 

@@ -16,10 +16,8 @@ from ..geometry.camera import project
 from ..geometry.sparse_model import SparseModel
 from ..sfm.bundle import Bundle, adjust_bundle, adjust_pose
 from ..sfm.rolling import rectified_bundle, rectified_pixels, velocities
-from ..types import Intrinsics, ProxyMaps, rows_by
+from ..types import Array, Intrinsics, ProxyMaps, rows_by
 from .state import Sightings, TrackState, sync_rig_poses
-
-Array = NDArray[np.float64]
 
 LoadProxy = Callable[[int], ProxyMaps | None]
 OUTLIER_SD = 4.0
@@ -137,12 +135,7 @@ def make_bundle(state: TrackState, frame_ids: list[int]) -> Bundle:
 
 
 def sample_depths(
-    bundle: Bundle,
-    frame_ids: list[int],
-    state: TrackState,
-    intrinsics: Intrinsics,
-    load_proxy: LoadProxy,
-    metric: bool,
+    bundle: Bundle, frame_ids: list[int], state: TrackState, intrinsics: Intrinsics, load_proxy: LoadProxy, metric: bool
 ) -> DepthTies:
     """Proxy depths of the keyframes at the bundle's observations."""
     depth, reliability = np.zeros(len(bundle.obs_cam)), np.zeros(len(bundle.obs_cam))

@@ -7,12 +7,10 @@ from ..depth.align import sample_proxy, scale_at_points
 from ..geometry import se3
 from ..geometry.camera import project, unproject
 from ..sfm.flow import FLOW_SD, corners, follow
-from ..types import Intrinsics
+from ..types import Array, Intrinsics
 from .pictures import Pictures
 from .pnp import MIN_INLIERS, POSE_ERROR
 from .state import FEATURE_SD, NO_SIGHTINGS, Sightings, TrackState
-
-Array = NDArray[np.float64]
 
 NEW_POINTS = 300
 """Points that a new keyframe should have."""

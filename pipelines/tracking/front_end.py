@@ -10,14 +10,12 @@ from ..geometry.camera import project, unproject
 from ..geometry.se3 import best_rotation
 from ..sfm.flow import FLOW_SD, corners, follow
 from ..sfm.matching import match_descriptors
-from ..types import Intrinsics
+from ..types import Array, Intrinsics
 from .extend import promote, start_segment
 from .pictures import Pictures
 from .pnp import MAX_GAP, MIN_INLIERS, FramePose, predict_pose, solve_pose
 from .relocalise import relocalise
 from .state import NO_SIGHTINGS, Sightings, TrackState
-
-Array = NDArray[np.float64]
 
 PATCH = 15
 """Side in pixels of what is followed from a keyframe. With 21 the path of a living room is a third worse, that of a

@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from ..geometry import se3
 from ..sfm.bundle import adjust_pose, reprojection_errors
-from ..types import Intrinsics
+from ..types import Array, Intrinsics
 
 MAX_GAP = 3
 """Frames over which a velocity is still believed."""
-
-Array = NDArray[np.float64]
 
 
 POSE_ERROR = 3.0

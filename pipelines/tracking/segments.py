@@ -4,7 +4,6 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -14,7 +13,7 @@ from ..geometry.se3 import Similarity
 from ..run.files import GIVEN_POSES
 from ..sfm.given import agreement
 from ..system.wording import stretches
-from ..types import GivenPoses
+from ..types import Array, GivenPoses
 from .pictures import Pictures
 from .pnp import MIN_INLIERS
 from .relocalise import group_by_points, recognise
@@ -24,8 +23,6 @@ _MAX_SCALE_SD = 0.1
 """Relative: over a stretch about as short as their own errors, given poses do not determine the scale."""
 _MIN_PATH, _JUMP = 5, 5.0
 """Poses that make a path, and how many times as far as is usual a wrong one lies aside of it."""
-
-Array = NDArray[np.float64]
 
 TRIES = 12
 """Keyframes of a segment that are looked for in another: the nearest in time, then those that look most like it."""

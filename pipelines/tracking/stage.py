@@ -5,16 +5,7 @@ from typing import Any
 from ...formats.errors import InputError
 from ..engine.stages import StageContext
 from ..geometry.camera import Rig, rig_of
-from ..run.files import (
-    BACKBONE,
-    CALIBRATION,
-    DEPTH_FIELDS,
-    FIGURES,
-    FRAMES,
-    GIVEN_POSES,
-    SPARSE,
-    TRAJECTORY,
-)
+from ..run.files import BACKBONE, CALIBRATION, DEPTH_FIELDS, FIGURES, FRAMES, GIVEN_POSES, SPARSE, TRAJECTORY
 from ..sfm.rolling import Shutter
 from ..system.memory import release_free_memory
 from ..system.progress import is_asked

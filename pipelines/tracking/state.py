@@ -16,9 +16,7 @@ from ..geometry import se3
 from ..geometry.camera import ONE_CAMERA, Rig
 from ..geometry.sparse_model import SparseModel
 from ..sfm.rolling import Shutter, velocities
-from ..types import Frame, Trajectory
-
-Array = NDArray[np.float64]
+from ..types import Array, Frame, Trajectory
 
 
 @dataclass(frozen=True)
