@@ -21,8 +21,15 @@ from ..types import Trajectory
 from .image_quality import DepthErrorSum, open_lpips, psnr, ssim
 from .labels import ClassMap, Counts, Matching, count_labels, label_cells, match_classes
 from .mesh_error import mesh_cells
-from .trajectory_error import AbsoluteError, ErrorStatistics, absolute_error, relative_error
-from .truth import MatchedTruth, match_by_time, match_truth
+from .truth import (
+    AbsoluteError,
+    ErrorStatistics,
+    MatchedTruth,
+    absolute_error,
+    match_by_time,
+    match_truth,
+    relative_error,
+)
 from .views import MapView, render_outcome
 
 KEYFRAMES, BETWEEN, HELD_OUT = "keyframes", "between", "held out"

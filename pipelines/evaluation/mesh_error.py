@@ -15,8 +15,7 @@ from ..outcome import Outcome
 from ..run.files import MESH
 from ..scene.world import FIRST, WORLD
 from ..types import Intrinsics
-from .trajectory_error import AbsoluteError
-from .truth import MatchedTruth
+from .truth import AbsoluteError, MatchedTruth
 
 SAMPLES = 200_000
 VIEWS = 60

@@ -23,7 +23,7 @@ from msgs_slam.pipelines.evaluation.html import Line, Marks, plot
 from msgs_slam.pipelines.evaluation.image_quality import DepthError, DepthErrorSum
 from msgs_slam.pipelines.evaluation.labels import matched_one_to_one, score
 from msgs_slam.pipelines.evaluation.mesh_error import depth_points, seen_in_depth, thinned
-from msgs_slam.pipelines.evaluation.trajectory_error import associate
+from msgs_slam.pipelines.evaluation.truth import associate
 from msgs_slam.pipelines.evaluation.views import depth_picture, depth_range, view_map
 from msgs_slam.pipelines.export.extra.atlas import simplified
 from msgs_slam.pipelines.export.extra.meshes import with_floor

@@ -13,7 +13,7 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.trajectory import read_tum
 from msgs_slam.pipelines.config import Config, FramesConfig, GlobalBaConfig
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.evaluation.trajectory_error import absolute_error
+from msgs_slam.pipelines.evaluation.truth import absolute_error
 from msgs_slam.pipelines.export.writers import write_trajectory
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel

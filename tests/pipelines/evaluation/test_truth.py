@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.trajectory import read_tum
-from msgs_slam.pipelines.evaluation.trajectory_error import absolute_error, associate, relative_error
+from msgs_slam.pipelines.evaluation.truth import absolute_error, associate, relative_error
 
 
 def random_poses(count: int, rng: np.random.Generator) -> NDArray:
