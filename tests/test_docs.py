@@ -315,3 +315,44 @@ def test_metadata_agrees_with_itself() -> None:
     assert f"version: {project['version']}" in citation
     assert project["urls"]["Method"].removeprefix("https://doi.org/") in citation
     assert project["description"] in (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+
+
+STARTED_ON_PAPER = """
+import argparse, contextlib, io, runpy, shlex, sys
+sys.path[:0] = [".", "tests/benchmarks"]
+parse = argparse.ArgumentParser.parse_args
+
+def stop_when_parsed(self, *given, **more):
+    parse(self, *given, **more)
+    sys.exit(0)
+
+argparse.ArgumentParser.parse_args = stop_when_parsed
+for line in sys.stdin.read().splitlines():
+    sys.argv, said, code = shlex.split(line, comments=True), io.StringIO(), "it asks for no options"
+    run = runpy.run_path if sys.argv[0].endswith(".py") else runpy.run_module
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        try:
+            run(sys.argv[0], run_name="__main__")
+        except SystemExit as end:
+            code = end.code
+        except Exception as error:
+            code = repr(error)
+    if code != 0:
+        print(line, code, said.getvalue()[-300:])
+"""
+
+
+def test_every_benchmark_starts_and_takes_the_options_of_its_page() -> None:
+    """In one process, as far as the options are read."""
+    page = (ROOT / "tests/benchmarks/README.md").read_text(encoding="utf-8").replace("\\\n", " ")
+    lines = [
+        re.sub(r"\.{3}|[][]", "", found) for found in re.findall(r"^    python (?:-m )?(tests\S.*)", page, re.MULTILINE)
+    ]
+    scripts = [p for p in (ROOT / "tests/benchmarks").glob("*.py") if "__main__" in p.read_text(encoding="utf-8")]
+    lines += [f"{p.relative_to(ROOT).as_posix()} --help" for p in sorted(scripts)]
+    assert len(lines) > len(scripts) + 40
+    done = subprocess.run(
+        [sys.executable, "-c", STARTED_ON_PAPER], input="\n".join(lines), capture_output=True, text=True, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""
