@@ -8,7 +8,8 @@ from pathlib import Path
 from ..errors import InputError
 from ..images import IMAGE_SUFFIXES, RAW_SUFFIXES
 from ..reading import reaching
-from . import benchmarks, colmap, folder, nerfstudio, replica, scannet
+from . import benchmarks, colmap, folder, nerfstudio, scannet
+from . import benchmarks as replica
 from .sequence import Sequence
 
 

@@ -26,7 +26,7 @@ from ..system.progress import Progress
 from ..types import Frame, any_of
 
 if TYPE_CHECKING:
-    from ..sfm.bridges import Picture
+    from ..sfm.flow import Picture
     from ..sfm.lens import Lens
     from ..source.faces import Faces
 

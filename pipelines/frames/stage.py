@@ -19,8 +19,8 @@ from ..engine.tasks import in_chunks
 from ..geometry.camera import Rig, rig_of
 from ..run.extension import parent_of
 from ..run.files import BACKBONE, CALIBRATION, FEATURES, GIVEN_POSES, MATCHED_PAIRS, SPARSE, VOCABULARY, save_frames
-from ..sfm.bridges import Picture
 from ..sfm.driver import Structure
+from ..sfm.flow import Picture
 from ..sfm.lens import Lens, distortion_of, make_lens
 from ..sfm.parallax import require_motion
 from ..sfm.rolling import straight_copy

@@ -32,8 +32,7 @@ from ..system.wording import stretches
 from ..tracking.adjust import settle
 from ..tracking.front_end import FrontEnd
 from ..tracking.pictures import Pictures
-from ..tracking.pnp import FramePose, predict_pose
-from ..tracking.relocalise import group_by_points, recognise
+from ..tracking.pnp import FramePose, group_by_points, predict_pose, recognise
 from ..tracking.state import FEATURE_SD, NO_SIGHTINGS, Sightings, TrackState
 from ..types import Array, Features, Trajectory
 

@@ -21,8 +21,7 @@ from ..geometry.room_layout import FLOOR, Gravity
 from ..geometry.voxels import Voxels, find, find_near, select, touching, voxel_keys
 from ..providers import DepthEstimate, LabelEstimate, Sequence, resample_linear
 from ..types import Frame
-from .parts import cut_parts, cut_patches
-from .segments import SegmentLabels, label_pixels
+from .segments import SegmentLabels, cut_parts, cut_patches, label_pixels
 
 _LYING = frozenset({"floor", "rug", "carpet", "floor mat", "earth", "road", "sidewalk", "grass", "field", "path"})
 _OVERHEAD = frozenset({"ceiling"})

@@ -18,9 +18,9 @@ from ..system.parallel import LruSequence, parallel_map
 from ..system.progress import log
 from ..types import Features, Vocabulary
 from .adjust import adjust
-from .bridges import Picture, weakly_connected, with_bridges
 from .candidates import GIVEN_ALONE, Adjusted, Candidates, KeyframeSet
 from .consistency import ModelReport, judge
+from .flow import Picture, weakly_connected, with_bridges
 from .given import bare_model, set_best_focal
 from .lens import set_lens
 from .matching import VerifiedPair, match_pair

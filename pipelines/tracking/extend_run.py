@@ -27,8 +27,7 @@ from ..system.progress import Progress
 from ..system.wording import quoted
 from ..types import Features
 from .pictures import Pictures, load_shutter
-from .pnp import MIN_INLIERS, solve_pose
-from .relocalise import relocalise
+from .pnp import MIN_INLIERS, relocalise, solve_pose
 from .state import FEATURE_SD, Sightings, TrackState
 
 _SAMPLES, _ENOUGH, _MIN_RECOGNISED = 24, 4, 2

@@ -13,8 +13,7 @@ from ..sfm.matching import match_descriptors
 from ..types import Array, Intrinsics
 from .extend import promote, start_segment
 from .pictures import Pictures
-from .pnp import MAX_GAP, MIN_INLIERS, FramePose, predict_pose, solve_pose
-from .relocalise import relocalise
+from .pnp import MAX_GAP, MIN_INLIERS, FramePose, predict_pose, relocalise, solve_pose
 from .state import NO_SIGHTINGS, Sightings, TrackState
 
 PATCH = 15

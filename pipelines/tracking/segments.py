@@ -15,8 +15,7 @@ from ..sfm.given import agreement
 from ..system.wording import stretches
 from ..types import Array, GivenPoses
 from .pictures import Pictures
-from .pnp import MIN_INLIERS
-from .relocalise import group_by_points, recognise
+from .pnp import MIN_INLIERS, group_by_points, recognise
 from .state import NO_SIGHTINGS, Sightings, TrackState
 
 _MAX_SCALE_SD = 0.1

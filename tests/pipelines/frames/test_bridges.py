@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.sfm.bridges import MIN_SHARED, Picture, bridged, weakly_connected
+from msgs_slam.pipelines.sfm.flow import MIN_SHARED, Picture, bridged, weakly_connected
 from msgs_slam.pipelines.sfm.matching import VerifiedPair, match_features
 from msgs_slam.pipelines.sfm.retrieval import describe, learn_vocabulary
 from msgs_slam.pipelines.types import Features

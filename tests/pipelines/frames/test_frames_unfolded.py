@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry.se3 import align_points
-from msgs_slam.pipelines.sfm.bridges import Picture
 from msgs_slam.pipelines.sfm.candidates import KeyframeSet
 from msgs_slam.pipelines.sfm.driver import StructureFromMotion
+from msgs_slam.pipelines.sfm.flow import Picture
 from msgs_slam.pipelines.sfm.lens import unknown_camera
 from msgs_slam.pipelines.sfm.matching import VerifiedPair, verify_matches
 from msgs_slam.pipelines.sfm.snapshots import Snapshots

@@ -10,7 +10,7 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import unproject
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.sfm.features import extract_features
-from msgs_slam.pipelines.tracking.relocalise import relocalise
+from msgs_slam.pipelines.tracking.pnp import relocalise
 from msgs_slam.pipelines.tracking.segments import agree
 from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
