@@ -3,6 +3,7 @@
     python tests/benchmarks/paper.py --work RUNS                             Replica office_0, then tables 7 to 10
     python tests/benchmarks/paper.py --work RUNS --data FOLDER --first 20    another sequence, its first frames
     python tests/benchmarks/paper.py --work RUNS --seeds 0,1,2,3,4 --ablation-frames 12
+    python tests/benchmarks/paper.py --work RUNS --first -1 --seeds 0,1 --ablation-frames 5    tables 7 to 10 alone
 
 Labels are the data set's, as in the paper. Depth is the true one with a network's kind of error, for the weights of
 Metric3D-V2 are not part of this program: a smooth field of 6 % that changes slowly from frame to frame, a slow scale
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.textfile import read_json_object, write_json
-from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.config import Config, with_method
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.paper import constants as paper_constants
@@ -48,6 +49,7 @@ PRINTED = {
 }
 """Of Replica office_0 in tables 1 and 3; with * the average over eight rooms in table 2. RTX 3090."""
 COLUMNS = ("PSNR", "SSIM", "LPIPS", "depth L1, cm", "ATE rmse, cm", "ATE mean, cm", "mIoU, %", "frames/s")
+HEAD = f"| | {' | '.join(COLUMNS)} |\n|{' --- |' * (len(COLUMNS) + 1)}"
 PLACES = (
     (("images", "keyframes", "psnr"), 1, 2), (("images", "keyframes", "ssim"), 1, 3),
     (("images", "keyframes", "lpips"), 1, 3),
@@ -135,53 +137,59 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--data", type=Path, default=OFFICE)
     parser.add_argument("--labels", default="semantic_class")
-    parser.add_argument("--first", type=int, default=0, help="frames of the main table; 0 = all")
+    parser.add_argument("--first", type=int, default=0, help="frames of the main table; 0 = all, -1 = leave it out")
     parser.add_argument("--seeds", default="0,1,2,3,4")
     parser.add_argument("--ablation-frames", type=int, default=12, help="of the other tables; 0 leaves them out")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="settings of every run")
     given = parser.parse_args()
     truth = open_sequence(given.data)
     camera = truth.camera
     assert camera is not None
-    count = min(given.first or len(truth), len(truth))
+    count = min(given.first, len(truth)) if given.first > 0 else len(truth)
     depth = network_like(truth, given.work / "depth", len(truth))
     known = [
         f"proxy.depth=files:{depth}", f"proxy.semantics=files:{given.data / given.labels}", "frames.rate=0",
-        f"frames.intrinsics={camera.fx},{camera.fy},{camera.cx},{camera.cy}", "run.format=images",
+        f"frames.intrinsics={camera.fx},{camera.fy},{camera.cx},{camera.cy}", "run.format=images", *given.set,
     ]  # fmt: skip
     methods = {"--method paper": "paper", "ours": "default"}
-    head = f"| | {' | '.join(COLUMNS)} |\n|{' --- |' * (len(COLUMNS) + 1)}"
-    print(f"{given.data.name}, {count} frames, true depth with a network's kind of error\n\n{head}", flush=True)
+    print(f"{given.data.name}, {count} frames, true depth with a network's kind of error")
+    if given.first >= 0:
+        main_table(given, truth, methods, known, count)
+    if given.ablation_frames:
+        print(f"\nAblations, the first {given.ablation_frames} frames, seeds {given.seeds}\n\n{HEAD}", flush=True)
+        ablations(given, truth, methods, known)
+
+
+def main_table(
+    given: argparse.Namespace, truth: Sequence, methods: dict[str, str], known: list[str], count: int
+) -> None:
+    """Print both methods on the first frames beside the printed figures."""
+    print(f"\n{HEAD}", flush=True)
+    source = linked(truth, given.work / f"first_{count}", count)
     for name, method in methods.items():
         config = load_config(None, [*known, f"run.method={method}"])
-        source = linked(truth, given.work / f"first_{count}", count)
-        print(
-            row(name, [values(measured(source, RunFolder(given.work / f"{method}_{count}.msgs"), config, truth))]),
-            flush=True,
-        )
+        found = measured(source, RunFolder(given.work / f"{method}_{count}.msgs"), config, truth)
+        print(row(name, [values(found)]), flush=True)
     for name, cells in PRINTED.items():
         print(f"| {name}, as printed | {' | '.join(cells)} |")
     print("\nScanNet cannot be had here (its licence); neither can Metric3D-V2's weights.")
-    if given.ablation_frames:
-        print(f"\nAblations, the first {given.ablation_frames} frames, seeds {given.seeds}\n\n{head}", flush=True)
-        ablations(given, truth, methods, known)
 
 
 def ablations(given: argparse.Namespace, truth: Sequence, methods: dict[str, str], known: list[str]) -> None:
     """Print tables 7 to 10 of both methods; frames and proxies are made once."""
-    source, seeds = (
-        linked(truth, given.work / f"first_{given.ablation_frames}", given.ablation_frames),
-        given.seeds.split(","),
-    )
+    source = linked(truth, given.work / f"first_{given.ablation_frames}", given.ablation_frames)
+    seeds = given.seeds.split(",")
     for label, method in methods.items():
-        base = RunFolder(given.work / f"base_{method}.msgs")
+        base = RunFolder(given.work / f"base_{method}_{given.ablation_frames}.msgs")
         reconstruct(source, base, load_config(None, [*known, f"run.method={method}"]), SilentProgress(), until="proxy")
         for name, (changed, settings) in ABLATIONS.items():
             if method == "default" and name != "all" and not settings:
                 continue
             runs = []
             for seed in seeds:
-                config = load_config(None, [*known, *settings, f"run.method={method}", f"run.seed={seed}"])
-                slug = "".join(c if c.isalnum() else "_" for c in f"{method}_{name}_{seed}")
+                overrides = [*known, *settings, f"run.method={method}", f"run.seed={seed}"]
+                config = with_method(load_config(None, overrides))
+                slug = "".join(c if c.isalnum() else "_" for c in f"{method}_{name}_{given.ablation_frames}_{seed}")
                 run = RunFolder(given.work / f"{slug}.msgs")
                 branch(base, run, ("frames", "proxy"), (all_stages(method), config))
                 runs.append(values(measured(source, run, config, truth, replace(PAPER, **changed))))

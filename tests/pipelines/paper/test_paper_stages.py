@@ -4,24 +4,30 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+import onnx
 import pytest
 import torch
 from click.testing import CliRunner
 from finished import note_finished
+from onnx import TensorProto, helper, numpy_helper
 
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.config import Config, ProxyConfig, RunConfig, with_method
+from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.paper import stages
 from msgs_slam.pipelines.paper.constants import PAPER, constants_of
+from msgs_slam.pipelines.paper.mapping import grow
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import all_stages
-from msgs_slam.pipelines.run.files import CLASS_IDS, DEPTH_FIELDS, MAP, SPARSE, TRAJECTORY
-from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.files import CLASS_IDS, CLASSES, DEPTH_FIELDS, MAP, SPARSE, TRAJECTORY
+from msgs_slam.pipelines.run.folder import RunFolder, load_settings
 from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.types import Trajectory
 from tests.pipelines.mapping.small_run import make_run
 
 CONFIG = Config(run=RunConfig(method="paper", threads=1))
@@ -176,3 +182,72 @@ def test_a_chosen_setting_that_the_paper_overrides_is_warned_of(
     assert done.exit_code == 0, done.output
     assert [f"{name} is not used" in done.output for name in lost] == [True] * len(lost)
     assert ("is not used" in done.output) == bool(lost)
+
+
+def dinov2_like(folder: Path) -> Path:
+    """A card of a network with DINOv2's inputs and outputs and made weights: a token of 14 x 14 pixels is their mean
+    colour, and the class token that of the image."""
+    shape = numpy_helper.from_array(np.array([1, 3, -1]), "shape")
+    nodes = [
+        helper.make_node("AveragePool", ["pixel_values"], ["means"], kernel_shape=[14, 14], strides=[14, 14]),
+        helper.make_node("GlobalAveragePool", ["pixel_values"], ["mean"]),
+        helper.make_node("Reshape", ["means", "shape"], ["patches"]),
+        helper.make_node("Reshape", ["mean", "shape"], ["whole"]),
+        helper.make_node("Concat", ["whole", "patches"], ["both"], axis=2),
+        helper.make_node("Transpose", ["both"], ["last_hidden_state"], perm=[0, 2, 1]),
+    ]
+    image = helper.make_tensor_value_info("pixel_values", TensorProto.FLOAT, [1, 3, "height", "width"])
+    tokens = helper.make_tensor_value_info("last_hidden_state", TensorProto.FLOAT, [1, "tokens", 3])
+    model = helper.make_model(
+        helper.make_graph(nodes, "dinov2", [image], [tokens], [shape]), opset_imports=[helper.make_opsetid("", 17)]
+    )
+    model.ir_version = 8
+    onnx.save(model, folder / "dinov2.onnx")
+    (folder / "card.toml").write_text(
+        'task = "segmentation"\nmodel = "dinov2.onnx"\ninput = "pixel_values"\noutput = "last_hidden_state"\n'
+        'kind = "tokens"\nwhite = 1.0\nmean = [0.485, 0.456, 0.406]\nstd = [0.229, 0.224, 0.225]\nmultiple = 14\n'
+    )
+    return folder / "card.toml"
+
+
+def test_features_of_dinov2_reach_labels_and_loops(
+    tmp_path: Path, world_sequence: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = RunFolder(tmp_path / "run.msgs")
+    words = [str(world_sequence), "--out", str(run.root), "--until", "proxy", "--method", "paper", "--depth", "files"]
+    chosen = ["--semantics", f"onnx:{dinov2_like(tmp_path)}", "--set", "frames.rate=2"]
+    done = CliRunner().invoke(main, ["reconstruct", *words, *chosen])
+    assert done.exit_code == 0, done.output
+    config = load_settings(run)
+    (folder := tmp_path / "global_ba").mkdir()
+    context = StageContext(run, run.root, config, folder, SilentProgress())
+    recording = stages.Recording(context)
+    ids = [f.id for f in recording.frames]
+    image = torch.stack([recording.views[i].colors.mean((0, 1)) for i in ids]).double().numpy()
+    seen = (image - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    asked = []
+
+    def noted(summaries: list, looks: np.ndarray, constants: object) -> list:
+        asked.append((summaries, looks))
+        return []
+
+    monkeypatch.setattr(stages, "candidates", noted)
+    every = np.ones(len(ids), bool)
+    poses = np.tile(np.eye(4), (len(ids), 1, 1))
+    trajectory = Trajectory(np.array(ids), np.arange(len(ids), dtype=float), poses, every, ("",) * len(ids))
+    at_first = torch.eye(4, dtype=torch.float64)
+    first = grow(None, recording.views[ids[0]], at_first, len(recording.class_ids)).map
+    stages._loops(context, recording, trajectory, DepthFields({}), first)
+    ((summaries, looks),) = asked
+    assert looks.shape == (len(ids), 3)
+    assert np.abs(looks - seen).max() < 0.05, "the class token, a unit vector"
+    assert {name.split()[0] for name in run.load(CLASSES).names} == {"cluster"}
+    for i, summary in zip(ids, summaries, strict=True):
+        labels = summary.labels
+        colors = np.array(
+            cv2.resize(recording.views[i].image.numpy(), labels.shape[::-1], interpolation=cv2.INTER_AREA)
+        )
+        spread = [colors[labels == c].std(0).mean() for c in np.unique(labels[labels != 255])]
+        assert len(spread) > 1
+        assert np.mean(spread) < 0.8 * colors.reshape(-1, 3).std(0).mean(), "alike in colour is alike in class"
