@@ -24,9 +24,9 @@ from .keyframes import overlap
 from .rerender import Rerendering, Samples, sample
 
 Array = NDArray[np.float64]
-PARTNERS = 6
-"""Keyframes that each is drawn into: of those that share enough with it some near and some far."""
-LOCAL_STEPS, GLOBAL_STEPS = (2, 3), (6, 8)
+PARTNERS, NEAR = 6, 4
+"""Keyframes that each is drawn into, of those that share enough with it: that many that share most, and others."""
+LOCAL_STEPS, GLOBAL_STEPS = (2, 2), (4, 6)
 """At most, at half the size and at the whole."""
 _SHARED = 0.4
 
@@ -68,15 +68,16 @@ def _adjusted(
 
 
 def pairs(samples: Sequence[Samples], poses: Array, fields: Array) -> list[tuple[int, int]]:
-    """Choose which keyframes are drawn into which (i, j): up to PARTNERS that share enough of i by (10), evenly from
-    those that share most to those that share least."""
+    """Choose which keyframes are drawn into which (i, j): up to PARTNERS that share enough of i by (10), most of
+    them those that share most, and the others evenly between these and that which shares least."""
     out = []
     for i, mine in enumerate(samples):
         depth = mine.depth * np.exp(mine.basis.of(fields[i]))
         points = se3.transform(se3.inverse(poses[i]), mine.rays * depth[:, None])[::5]
         shares = np.array([overlap(points, poses[j], samples[j].camera) if j != i else 0.0 for j in range(len(poses))])
         order = np.argsort(-shares, kind="stable")[: int((shares > _SHARED).sum())]
-        places = np.unique(np.linspace(0, len(order) - 1, min(PARTNERS, len(order))).round().astype(int))
+        far = np.linspace(NEAR, len(order) - 1, PARTNERS - NEAR).round().astype(int)
+        places = [*range(min(NEAR, len(order))), *(np.unique(far) if len(order) > NEAR else ())]
         out += [(i, int(j)) for j in order[places]]
     return out
 

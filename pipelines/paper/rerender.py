@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import cg
+from scipy.sparse.linalg import LinearOperator, cg
 
 from ..depth.fields import FINE, Basis
 from ..geometry import se3
@@ -27,10 +27,10 @@ from .constants import PAPER, Constants
 Array = NDArray[np.float64]
 CELL = 6
 """Of each square of so many pixels the one on the strongest edge is drawn."""
-SD_COLOR, SD_CLASS, SD_DEPTH = 0.05, 0.5, 0.1
+SD_COLOR, SD_CLASS, SD_DEPTH = 0.02, 0.2, 0.05
 """Of colours and class colours in 0..1 and of log depths; larger differences count less and less (Cauchy)."""
-FIELD_SD, STEP_SD = 0.1, 0.05
-"""Of a field's nodes, and of the differences between neighbours."""
+FIELD_SD, STEP_SD = 0.4, 0.2
+"""Of a field's nodes, and of the differences between neighbours: weak, for many pixels say the same."""
 POSE_SD = 0.05
 """Of a pose beside where it was, in scene depths and radians: weak beside what is drawn."""
 SAME_SURFACE = 0.15
@@ -43,6 +43,8 @@ _ROW = 20
 """Entries in a row of the Jacobian: two twists and four nodes of each field."""
 _PAIRS_AT_ONCE = 32
 """Whose rows are held together: 30 MB."""
+_DAMPINGS = (1e-6, 1e-3)
+"""Tried one after the other. A path bends along motions that hardly any pixel sees: more damping holds it bent."""
 _DIRECT = 3000
 """Up to so many unknowns the normal equations are solved directly."""
 
@@ -225,33 +227,44 @@ class Rerendering:
         n = len(self.samples)
         free = np.repeat(np.stack([self.moves, self.bends], 1).ravel(), np.tile([6, FINE.size], n))
         prior, apart = self.priors()
-        prior = prior.tocsc()[:, free].tocsr()
-        normal, right, delta = prior.T @ prior, -(prior.T @ apart), np.zeros(n * _UNKNOWNS)
+        normal, right = prior.T @ prior, -(prior.T @ apart)
         for begin in range(0, len(self.pairs), _PAIRS_AT_ONCE):
             parts = [self.equations(i, j) for i, j in self.pairs[begin : begin + _PAIRS_AT_ONCE]]
             values, unknowns, residuals = (np.concatenate(p) for p in zip(*parts, strict=True))
             shape, ends = (len(values), n * _UNKNOWNS), np.arange(0, values.size + 1, _ROW)
-            rows = sparse.csr_matrix((values.ravel(), unknowns.ravel(), ends), shape).tocsc()[:, free].tocsr()
+            rows = sparse.csr_matrix((values.ravel(), unknowns.ravel(), ends), shape)
             normal, right = normal + rows.T @ rows, right - rows.T @ residuals
-        normal = (normal + sparse.diags(damping * normal.diagonal() + 1e-12)).tocsr()
-        if len(right) <= _DIRECT:
-            delta[free] = np.linalg.solve(normal.toarray(), right)
-        else:
-            delta[free] = cg(normal, right, rtol=1e-4, maxiter=1000, M=sparse.diags(1 / normal.diagonal()))[0]
+        mask = sparse.diags(free.astype(float))
+        diagonal = np.where(free, damping * normal.diagonal() + 1e-12, 1.0)
+        normal = (mask @ normal @ mask + sparse.diags(diagonal)).tocsr()
+        delta = _solved(normal, np.where(free, right, 0.0))
         each = delta.reshape(n, _UNKNOWNS)
         return replace(self, poses=se3.exp(each[:, :6]) @ self.poses, fields=self.fields + each[:, 6:])
 
     def minimised(self, steps: int) -> Rerendering:
-        """At most so many steps, as long as they lower the cost by a hundredth."""
+        """At most so many steps, as long as they lower the cost."""
         best, cost = self, self.cost()
-        for damping in [1e-3] * steps:
-            there = best.stepped(damping)
-            if not (found := there.cost()) < cost:
-                break
-            best, gain, cost = there, cost - found, found
-            if gain < 0.01 * cost:
+        for _ in range(steps):
+            tried = ((there := best.stepped(d), there.cost()) for d in _DAMPINGS)
+            there, found = next((t for t in tried if t[1] < cost), (best, cost))
+            gain, best, cost = cost - found, there, found
+            if gain < 0.002 * cost:
                 break
         return best
+
+
+def _solved(normal: sparse.csr_matrix, right: Array) -> Array:
+    """(U,) the solution: of few keyframes at once, of many by conjugate gradients, each keyframe's own block undone."""
+    if len(right) <= _DIRECT:
+        return np.asarray(np.linalg.solve(normal.toarray(), right))
+    begins = range(0, len(right), _UNKNOWNS)
+    own = np.linalg.inv(np.stack([normal[b : b + _UNKNOWNS, b : b + _UNKNOWNS].toarray() for b in begins]))
+
+    def undone(vector: Array) -> Array:
+        return (own @ vector.reshape(len(own), _UNKNOWNS, 1)).ravel()
+
+    before = LinearOperator(normal.shape, matvec=undone, dtype=np.float64)
+    return np.asarray(cg(normal, right, rtol=1e-5, maxiter=1000, M=before)[0])
 
 
 def pose_term(poses: Array, start: Array, unit: float) -> Array:
