@@ -179,9 +179,9 @@ def _converted(key: str, value: Any, kind: Any) -> Any:
             return tuple(str(v) for v in value)
         number = int if "int" in str(kind) else float
         return tuple(number(v) for v in value)
-    if kind == "bool" and not isinstance(value, bool):
+    if kind is bool and not isinstance(value, bool):
         raise ValueError(f"{key} is true or false, got {value!r}")
-    return {"float": float, "int": int, "bool": bool, "str": str}[str(kind)](value)
+    return kind(value)
 
 
 def _check(card: Card, path: Path) -> None:
