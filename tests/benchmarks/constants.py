@@ -45,12 +45,12 @@ AFTER = {
     "colours of far evidence": ("fill.py", "_REACHES = ((1 / 16, 30.0, 1.0), (1 / 4, 60.0, 0.1))", "60.0"),
     "weight of far evidence": ("fill.py", "_REACHES = ((1 / 16, 30.0, 1.0), (1 / 4, 60.0, 0.1))", "0.1"),
     "ridge of planes": ("fill.py", "_RIDGE = 3e-4", "3e-4"),
-    "faint variance": ("evidence.py", "_FAINT, _POWER = 5e-5, 0.25", "5e-5"),
-    "power of contrast": ("evidence.py", "_FAINT, _POWER = 5e-5, 0.25", "0.25"),
-    "clear variance": ("evidence.py", "_CLEAR = 2e-4", "2e-4"),
-    "colours of borrowing": ("borrow.py", "_COLOR_SD = 3.0", "3.0"),
-    "borrowed depths agree": ("borrow.py", "_AGREE = 0.02", "0.02"),
-    "likeness to borrow": ("borrow.py", "_LEAST = 0.5", "0.5"),
+    "faint variance": ("fill.py", "_FAINT, _POWER = 5e-5, 0.25", "5e-5"),
+    "power of contrast": ("fill.py", "_FAINT, _POWER = 5e-5, 0.25", "0.25"),
+    "clear variance": ("fill.py", "_CLEAR = 2e-4", "2e-4"),
+    "colours of borrowing": ("fill.py", "_COLOR_SD = 3.0", "3.0"),
+    "borrowed depths agree": ("fill.py", "_AGREE = 0.02", "0.02"),
+    "likeness to borrow": ("fill.py", "_LEAST = 0.5", "0.5"),
 }
 """Name → file, its line, and the number in the line that is changed."""
 WITHIN = {

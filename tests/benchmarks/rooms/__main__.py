@@ -3,7 +3,7 @@
     python -m tests.benchmarks.rooms make DIR --set judge                   rooms of a set and the stereo's first pass
     python -m tests.benchmarks.rooms measure DIR NAME --set judge           the product's depth of them, kept as NAME
     python -m tests.benchmarks.rooms table DIR OLD [NEW] --set judge        one against the other
-    python -m tests.benchmarks.rooms learn DIR                              the model that chooses, from the set `learn`
+    python -m tests.benchmarks.rooms learn DIR                              a learned choice, from the set `learn`
     python -m tests.benchmarks.rooms measure DIR NAME --choice              the depth that it chooses
 
 A default about depth is chosen on `choose` and reported on `judge`. A room is a seed: walls, textures, light, furniture
@@ -22,6 +22,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from msgs_slam.formats.tensors import save_arrays
 
 from .choice.completion import Completion
 from .choice.model import load_model
@@ -49,7 +51,8 @@ def seeds_of(folder: Path, name: str, make: bool = False, package: Path | None =
             if clip is None:
                 continue
             clip.save(path)
-            clip.stereo(folder / "stereo" / str(seed))
+            if name != "learn":
+                clip.stereo(folder / "stereo" / str(seed))
             print(f"{seed} {clip.kind}: {time.process_time() - start:.1f} CPU seconds", flush=True)
         if path.exists():
             found.append(seed)
@@ -62,10 +65,10 @@ def learn_choice(folder: Path, most: int) -> None:
 
     chosen = seeds_of(folder, "choose")
     learned = seeds_of(folder, "learn", most=most)
-    parts = gather(folder, learned + chosen), gather(folder, learned, as_worn=True)
+    parts = gather(folder, learned, worse=True), gather(folder, chosen, worse=False)
     evidence, errors, rooms = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     print(f"{len(np.unique(rooms))} rooms, {len(rooms)} pixels", flush=True)
-    np.savez(folder / MODEL, **learn(evidence, errors, rooms, np.isin(rooms, chosen)).weights())
+    save_arrays(folder / MODEL, learn(evidence, errors, rooms, np.isin(rooms, chosen)).weights())
 
 
 def measure(folder: Path, seeds: list[int], name: str, choice: bool = False) -> None:

@@ -10,53 +10,58 @@ from torch import nn
 from msgs_slam.pipelines.depth.stereo.fill import SURE
 
 from ..clip import Clip, worn
-from .completion import Case, Completion
+from .candidates import KINDS
+from .completion import Completion
+from .evidence import FEATURES
 
-_PIXELS, _EVERY = 600, 2
+_PIXELS, _EVERY = 700, 2
 """Pixels of a keyframe, and keyframes of a clip, that are learned from."""
-_WIDTHS = (64, 32)
-_EPOCHS, _BATCH, _RATE = 12, 1024, 3e-3
-_HARD, _MISS = 0.03, 0.1
-_SHARP = 0.02
+_WIDTHS = (48, 24)
+_EPOCHS, _BATCH, _RATE = 10, 1024, 3e-3
+_HIDDEN = 0.1
+_HARD = 0.03
+_SHARP = 0.04
 """Log depth: candidates so near to the truth are right."""
 
 
 def gather(
-    folder: Path, seeds: list[int], as_worn: bool = False
-) -> tuple[NDArray[np.float16], NDArray[np.float32], NDArray[np.int64]]:
-    """Evidence (P, K, F), the error of each candidate in log depth (P, K), at most 1, and the room of each pixel; by a
-    worse camera where `as_worn`, then rooms have negative numbers."""
+    folder: Path, seeds: list[int], worse: bool
+) -> tuple[NDArray[np.float16], NDArray[np.float16], NDArray[np.int64]]:
+    """Evidence (P, K, F), the error of each candidate in log depth (P, K), and the room of each pixel; every second
+    room by a worse camera where that is wanted."""
     parts: list[tuple[NDArray, NDArray, NDArray]] = []
     for seed in seeds:
-        path = folder / "cases" / f"{seed}{'w' * as_worn}.npz"
+        path = folder / "cases" / f"{seed}.npz"
         if not path.exists():
             path.parent.mkdir(exist_ok=True)
-            evidence, errors = _of_room(folder, seed, as_worn)
+            evidence, errors = _of_room(folder, seed, worse and seed % 2 == 1)
             np.savez(path, evidence=evidence, errors=errors)
         with np.load(path, allow_pickle=False) as held:
-            parts.append((held["evidence"], held["errors"], np.full(len(held["errors"]), -seed if as_worn else seed)))
+            parts.append((held["evidence"], held["errors"], np.full(len(held["errors"]), seed)))
     evidence, errors, rooms = (np.concatenate(c) for c in zip(*parts, strict=True))
     return evidence, errors, rooms
 
 
-def _of_room(folder: Path, seed: int, as_worn: bool) -> tuple[NDArray[np.float16], NDArray[np.float32]]:
+def _of_room(folder: Path, seed: int, as_worn: bool) -> tuple[NDArray[np.float16], NDArray[np.float16]]:
     clip, rng = Clip.load(folder / f"{seed}.npz"), np.random.default_rng(seed)
     clip = worn(clip, seed) if as_worn else clip
     provider, frames = clip.stereo(folder / "stereo" / f"{seed}{'w' * as_worn}")
     completion = Completion(provider)
-    evidence, errors = [np.zeros((0, 17, 37), np.float16)], [np.zeros((0, 17), np.float32)]
-    for index in range(seed % _EVERY, len(frames), _EVERY):
+    evidence, errors = [np.zeros((0, len(KINDS), FEATURES), np.float16)], [np.zeros((0, len(KINDS)), np.float16)]
+    for index in range(seed // 2 % _EVERY, len(frames), _EVERY):
         case = completion.case(index)
         if case is None:
             continue
-        truth = half_truth(clip.truth[index]).ravel()[case.found.pixels]
-        known = np.flatnonzero(truth > 0)
+        truth = half_truth(clip.truth[index])
         if as_worn:  # one scale for each view, as a run has one
-            sure = case.known.confidence >= SURE
-            truth = truth / np.median((half_truth(clip.truth[index]) * case.known.inverse)[sure])
+            sure = case.own.confidence >= SURE
+            truth = truth / np.median((truth * case.own.inverse)[sure])
+        truth = truth.ravel()[case.found.pixels]
+        known = np.flatnonzero(truth > 0)
         rows = np.sort(rng.choice(known, min(_PIXELS, len(known)), replace=False))
         evidence.append(case.evidence[rows].astype(np.float16))
-        errors.append(errors_of(case, truth)[rows])
+        inverse = np.maximum(case.found.inverse[rows], 1e-9)
+        errors.append(np.clip(-np.log(inverse * truth[rows, None]), -4, 4).astype(np.float16))
     return np.concatenate(evidence), np.concatenate(errors)
 
 
@@ -69,33 +74,24 @@ def half_truth(depth: NDArray) -> NDArray[np.float32]:
     return np.asarray(middle, np.float32)
 
 
-def errors_of(case: Case, truth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(P, K) |log depth ratio| of every candidate, at most 1; 1 for none."""
-    inverse = case.found.inverse
-    error = np.abs(np.log(np.maximum(inverse, 1e-6) * np.maximum(truth, 1e-3)[:, None]))
-    return np.where(inverse > 0, np.minimum(error, 1), 1).astype(np.float32)
-
-
 class Judge(nn.Module):
     """What `ChoiceModel` evaluates."""
 
     def __init__(self, features: int, kinds: int) -> None:
         super().__init__()
         one, two = _WIDTHS
-        self.kinds = kinds
         self.first, self.around = nn.Linear(features + kinds, one), nn.Linear(one, one)
         self.second, self.context = nn.Linear(one, two), nn.Linear(one, two, bias=False)
-        self.last = nn.Linear(two, 2)
+        self.last = nn.Linear(two, 1)
 
-    def forward(self, features: torch.Tensor, real: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Logits and log errors (P, K)."""
+    def forward(self, features: torch.Tensor, real: torch.Tensor) -> torch.Tensor:
+        """Logits (P, K) of candidates (P, K, F), of which some are `real` (P, K)."""
         size = features.shape[-1]
         hidden = features @ self.first.weight[:, :size].T + (self.first.weight[:, size:].T + self.first.bias)
         hidden = torch.relu(hidden) * real[..., None]
         mean = hidden.sum(1) / real.sum(1).clamp(min=1)[:, None]
-        around = torch.relu(self.around(mean))
-        out = self.last(torch.relu(self.second(hidden) + self.context(around)[:, None]))
-        return out[..., 0].masked_fill(real == 0, -30.0), out[..., 1].clamp(-8, 0)
+        around = self.context(torch.relu(self.around(mean)))
+        return self.last(torch.relu(self.second(hidden) + around[:, None]))[..., 0].masked_fill(real == 0, -30.0)
 
     def weights(self) -> dict[str, NDArray[np.float16]]:
         """As `ChoiceModel` takes them."""
@@ -108,7 +104,7 @@ class Judge(nn.Module):
 
 
 def learn(
-    evidence: NDArray[np.float16], errors: NDArray[np.float32], rooms: NDArray[np.int64], tested: NDArray[np.bool_]
+    evidence: NDArray[np.float16], errors: NDArray[np.float16], rooms: NDArray[np.int64], tested: NDArray[np.bool_]
 ) -> Judge:
     """Learn from the pixels that are not `tested`; print the error of the fill and of the choice on those that are. A
     room counts more where the fill is good: nothing may be lost there."""
@@ -116,7 +112,7 @@ def learn(
     model = Judge(evidence.shape[2], evidence.shape[1])
     data, truth = torch.from_numpy(evidence), torch.from_numpy(errors)
     room = np.unique(rooms, return_inverse=True)[1]
-    hardness = np.bincount(room, errors[:, 0]) / np.bincount(room)
+    hardness = np.bincount(room, np.minimum(np.abs(errors[:, 0].astype(np.float64)), 1)) / np.bincount(room)
     counts = 1 / (hardness + _HARD)
     weight = torch.from_numpy((counts / counts.mean()).astype(np.float32)[room])
     train, test = (torch.from_numpy(np.flatnonzero(x)) for x in (~tested, tested))
@@ -128,7 +124,7 @@ def learn(
         for first in range(0, len(order) - _BATCH + 1, _BATCH):
             rows = order[first : first + _BATCH]
             optimizer.zero_grad()
-            loss = _loss(model, data[rows].float(), truth[rows], weight[rows])
+            loss = (weight[rows] * _loss(model, data[rows].float(), truth[rows].float())).mean()
             loss.backward()
             optimizer.step()
             schedule.step()
@@ -136,23 +132,25 @@ def learn(
     return model
 
 
-def _loss(model: Judge, features: torch.Tensor, error: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Expected error of the choice, how far it is from the right candidates, and the likelihood of the errors as
-    predicted (exponential, so that their mean is learned)."""
+def _loss(model: Judge, features: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
+    """How far what is likely is from the right candidates (cross-entropy). A part of the evidence is hidden at random:
+    rooms are seldom like those that were made."""
     real = (features != 0).any(-1).float()
-    logits, predicted = model(features, real)
-    share = torch.softmax(logits, 1)
-    wanted = torch.softmax((-error / _SHARP).masked_fill(real == 0, -1e4), 1)
-    right = -(wanted * torch.log_softmax(logits, 1)).sum(1)
-    likelihood = ((error + 1e-3) * torch.exp(-predicted) + predicted) * real
-    missed = (share * (error + _MISS * error / (error + _SHARP))).sum(1)
-    return (weight * (5 * missed + 0.3 * right)).mean() + 0.1 * likelihood.sum() / real.sum()
+    logits = model(features * (torch.rand(len(features), 1, features.shape[2]) > _HIDDEN), real)
+    wanted = torch.softmax((-error.abs() / _SHARP).masked_fill(real == 0, -1e4), 1)
+    return -(wanted * torch.log_softmax(logits, 1)).sum(1)
 
 
 def _tested(model: Judge, data: torch.Tensor, truth: torch.Tensor, rows: torch.Tensor) -> str:
-    with torch.no_grad():
-        parts = [model(f := data[r].float(), (f != 0).any(-1).float())[0].argmax(1) for r in rows.split(8192)]
-    error = truth[rows]
-    chosen = error.gather(1, torch.cat(parts)[:, None])[:, 0] if parts else error[:, 0]
-    cells = (("fill", error[:, 0]), ("chosen", chosen), ("best", error.min(1).values))
+    """Errors of the fill, of the candidate of the least expected error, and of the best."""
+    chosen = []
+    for part in rows.split(8192):
+        with torch.no_grad():
+            features, error = data[part].float(), truth[part].float()
+            real = (features != 0).any(-1).float()
+            share = torch.softmax(model(features, real), 1)
+            risk = ((error[:, :, None] - error[:, None]).abs().clamp(max=1) * share[:, None]).sum(2) + 9 * (1 - real)
+            chosen.append(error.abs().gather(1, risk.argmin(1)[:, None])[:, 0])
+    off = truth[rows].float().abs().clamp(max=1)
+    cells = (("fill", off[:, 0]), ("chosen", torch.cat(chosen).clamp(max=1)), ("best", off.min(1).values))
     return "  ".join(f"{n} {e.mean():.4f} ({100 * (e > np.log(1.05)).float().mean():.1f} % off)" for n, e in cells)
