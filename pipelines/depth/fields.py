@@ -19,7 +19,7 @@ from scipy.sparse.linalg import cg
 from ..types import ProxyMaps
 
 _ROWS_AT_ONCE = 200_000
-_MOST_ITERATIONS = 500
+_MAX_ITERATIONS = 500
 """Of conjugate gradients; 600 keyframes that hang together by pairs alone took 129."""
 log = logging.getLogger("msgs_slam")
 Array = NDArray[np.float64]
@@ -166,13 +166,13 @@ def solve_fields(parts: Iterable[Equations], fields: Array, expected: Array, pri
         while len(normals) > 1 and normals[-2].nnz <= 2 * normals[-1].nnz:
             normals[-2:] = [normals[-2] + normals[-1]]
     normal = sum(normals[:-1], normals[-1])
-    change, unsolved = cg(normal, right, rtol=1e-6, maxiter=_MOST_ITERATIONS, M=sparse.diags(1 / normal.diagonal()))
+    change, unsolved = cg(normal, right, rtol=1e-6, maxiter=_MAX_ITERATIONS, M=sparse.diags(1 / normal.diagonal()))
     if unsolved:
         log.warning(
             "the scales of depth of %d keyframes did not converge in %d iterations and stay as they were: depth may "
             "disagree between these keyframes. Check the depth files or the depth network",
             len(fields),
-            _MOST_ITERATIONS,
+            _MAX_ITERATIONS,
         )
         return fields
     return fields + change.reshape(fields.shape)

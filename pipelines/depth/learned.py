@@ -15,7 +15,7 @@ from ..types import Frame
 from .scale import depth_at_points
 
 Array = NDArray[np.float64]
-_LEAST_POINTS = 12
+_MIN_POINTS = 12
 _ENOUGH_POINTS = 40
 _NEIGHBOURS = 5
 """A frame with few points of its own takes those of so many neighbours in time on either side too."""
@@ -117,7 +117,7 @@ class AlignedDepth(DepthProvider):
             reach = 0 if len(seen[i][0]) >= _ENOUGH_POINTS else _NEIGHBOURS
             near = seen[max(0, i - reach) : i + reach + 1]
             values, z = (np.concatenate([s[k] for s in near]) for k in (0, 1))
-            if len(values) >= _LEAST_POINTS:
+            if len(values) >= _MIN_POINTS:
                 self._fits[frame.id] = fit_relative(values, z, self._relative)
                 own = to_depth(seen[i][0], self._fits[frame.id], self._relative)
                 self._spreads.append(float(np.median(np.abs(own / seen[i][1] - 1))) if len(own) else 1.0)

@@ -10,7 +10,7 @@ from ..geometry.camera import project
 from ..providers import DepthEstimate, Sequence
 from ..types import Frame
 
-_LEAST_POINTS = 20
+_MIN_POINTS = 20
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def measure_scale(sequence: Sequence, frames: list[Frame], depth_of: Callable[[F
     for frame in frames:
         if frame.id in sequence.cam_from_world:
             depth, z = depth_at_points(sequence, frame, depth_of(frame).depth)
-            if len(z) >= _LEAST_POINTS:
+            if len(z) >= _MIN_POINTS:
                 of_frame[frame.id] = float(np.median(depth / z))
                 spread_in[frame.id] = 1.4826 * float(np.median(np.abs(depth / z / of_frame[frame.id] - 1)))
     return DepthScale(of_frame, spread_in)

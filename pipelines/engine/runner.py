@@ -16,7 +16,7 @@ from ...formats.errors import DiskFullError, InputError, RecoverableError
 from ..config import STAGES, Config
 from ..run.ending import FINGERPRINT, empty, find_sealed, move_in, results, seal, unseal
 from ..run.folder import RunFolder, load_records, save_settings
-from ..run.manifest import Manifest, Source, StageRecord, content_digest, plain, settings_of, write_manifest
+from ..run.manifest import Manifest, Source, StageRecord, content_digest, finite_or_none, settings_of, write_manifest
 from ..system.memory import release_free_memory
 from ..system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log, stop_if_asked
 from ..system.wording import quoted
@@ -219,7 +219,7 @@ def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any,
     seconds, memory = time.monotonic() - started, peak_memory_mb()
     content, settings = content_digest(files), settings_of(config, stage.name)
     record = StageRecord(
-        fingerprint, files, seconds, memory, plain(figures), context.warnings, content, inputs, settings
+        fingerprint, files, seconds, memory, finite_or_none(figures), context.warnings, content, inputs, settings
     )  # fmt: skip
     seal(folder, record)
     return record

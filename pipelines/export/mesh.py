@@ -40,14 +40,14 @@ from .volume import BEHIND, Grid, fuse, make_grid
 
 TRUNCATION = 3.0
 """Voxels on either side of a surface that a depth speaks for."""
-LEAST_WEIGHT = 0.5
+MIN_WEIGHT = 0.5
 """A voxel seen with less weight, in views at the median depth, has no surface."""
 LONG = 200
 """Keyframes of a recording for which `export.max_blocks` is meant; a longer one may have more by its length."""
 SURE = 0.5
 """Confidence of a proxy's depth from which the depth drawn there stays where it is."""
 _KEPT_BYTES = 100e6
-MOST_TEXTURED = 4_000_000
+MAX_TEXTURED = 4_000_000
 """Triangles of a mesh that is wrapped in a texture: an image of 4096 pixels a side shows a larger one no better than
 the colours of its vertices do."""
 
@@ -97,7 +97,7 @@ def write_meshes(job: MeshJob, outcome: Outcome, world: World) -> list[Path]:
     mesh, paths = mesh_blocks(job.ply), [job.ply] if "mesh" in job.kinds else []
     if not mesh.face_count:
         return paths
-    if "obj" not in job.kinds and (mesh.face_count > MOST_TEXTURED or not settings.texture):
+    if "obj" not in job.kinds and (mesh.face_count > MAX_TEXTURED or not settings.texture):
         write_mesh_glb(glb, mesh, names, axes)
         return [*paths, glb]
     textured = make_textured(outcome, read_mesh_ply(job.ply), Shown(views), job.context.progress)
@@ -213,7 +213,7 @@ def _region(
     """One of the regions of the grid, from the views that see it; `of` names it for the progress."""
     near = grid.views_of(chunks)
     fusing = (views[n].shown for n in progress.track(near, "fusing" + of, len(near)))
-    triangles = chunk_surfaces(fuse(grid, chunks, fusing), chunks, LEAST_WEIGHT)
+    triangles = chunk_surfaces(fuse(grid, chunks, fusing), chunks, MIN_WEIGHT)
     surface = closed(weld(triangles, chunks, grid.voxel), (views[n].shown for n in near), BEHIND * grid.truncation)
     painting = (views[n] for n in progress.track(near, "painting" + of, len(near)))
     return Region(surface, *paint(surface.vertices, painting, class_ids, 2 * grid.truncation))

@@ -24,7 +24,7 @@ _STRETCH = 1.4
 
 Array = NDArray[np.float64]
 
-_MOST, _LEAST_SHARE, _LEAST_VOXELS = 20, 0.01, 30
+_MAX_PLANES, _MIN_SHARE, _MIN_VOXELS = 20, 0.01, 30
 """Planes, and the share of the sure surface and the voxels that each has at least."""
 _HYPOTHESES, _COUNTED = 200, 20_000
 """Planes through a voxel that are tried for each that is found, and voxels by which they are compared."""
@@ -54,16 +54,16 @@ def find_planes(voxels: Voxels) -> Planes:
     """The largest planes of a surface; the same ones every time."""
     rng, left, total = np.random.default_rng(0), np.ones(len(voxels), bool), voxels.weight.sum()
     normals, offsets, cubes = [], [], []
-    for _ in range(_MOST):
-        if left.sum() < _LEAST_VOXELS:
+    for _ in range(_MAX_PLANES):
+        if left.sum() < _MIN_VOXELS:
             break
         on = _largest(voxels, np.flatnonzero(left), rng)
-        if voxels.weight[on].sum() < _LEAST_SHARE * total or len(on) < _LEAST_VOXELS:
+        if voxels.weight[on].sum() < _MIN_SHARE * total or len(on) < _MIN_VOXELS:
             break
         normal, offset, on = _fitted(voxels, left, on)
         left &= ~_on(voxels, normal, offset, _TAKEN, ROUGHLY_ALONG)
         left[on] = False
-        if len(on) >= _LEAST_VOXELS:
+        if len(on) >= _MIN_VOXELS:
             normals.append(normal)
             offsets.append(offset)
             cubes.append(_believed(voxels, normal, offset, on))
@@ -93,7 +93,7 @@ def _fitted(voxels: Voxels, left: NDArray[np.bool_], on: NDArray[np.int64]) -> t
         normal = normal * (1 if (voxels.normal[on] @ normal).sum() > 0 else -1)
         offset = float(middle @ normal)
         on = np.flatnonzero(left & _on(voxels, normal, offset, _THICK, _ALONG))
-        if len(on) < _LEAST_VOXELS:
+        if len(on) < _MIN_VOXELS:
             break
     return normal, offset, on
 

@@ -22,7 +22,7 @@ from ..geometry.posed_depth import PosedDepth
 from ..system.jit import kernel
 from .volume import CHUNK, HINT, SIDE, Volume, chunk_keys
 
-LEAST_PIECE = 0.01
+MIN_PIECE = 0.01
 """Connected pieces with fewer faces than this share of the largest one's are floaters."""
 
 _STEPS = 1000
@@ -248,7 +248,7 @@ class _Chosen:
         return kept
 
 
-def joined(regions: Callable[[], Iterable[Region]], least_share: float = LEAST_PIECE) -> MeshBlocks:
+def joined(regions: Callable[[], Iterable[Region]], least_share: float = MIN_PIECE) -> MeshBlocks:
     """The mesh of these regions, a block each, without the connected pieces that have fewer faces than `least_share` of
     the largest one's."""
     sizes = [_Sizes.of(region.surface) for region in regions()]

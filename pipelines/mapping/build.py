@@ -30,9 +30,9 @@ from .submap_tasks import (
     STEPS,
     SubmapResult,
     SubmapTask,
-    belonging,
-    in_order,
     measure_submap,
+    merge_results,
+    select_own,
 )
 from .submaps import Submap, divide
 
@@ -99,7 +99,7 @@ def refine_map(
     for task in tasks:
         rows = np.isin(ids, task.submap.own)
         poses = rows_of(trajectory, task.submap.own).cam_from_world
-        own = belonging(gaussian_map, anchors, task.submap) if len(tasks) > 1 else gaussian_map
+        own = select_own(gaussian_map, anchors, task.submap) if len(tasks) > 1 else gaussian_map
         nothing = np.zeros((0, 1, 1), np.float32), np.zeros(1, np.int64)
         task.save(JOINED, SubmapResult(own, ids[rows], poses, exposures[0][rows], exposures[1][rows], *nothing))
     kind = _each(context, tasks, REFINED, AGREED)
@@ -192,7 +192,7 @@ def _survey(tasks: Sequence[SubmapTask], kind: str) -> _Survey:
         result = task.load(kind, task.number)
         results.append(result.without_map)
         counts.append(len(result.gaussian_map))
-    return _Survey(*in_order(results), counts, sum(int(r.steps.sum()) for r in results))
+    return _Survey(*merge_results(results), counts, sum(int(r.steps.sum()) for r in results))
 
 
 def all_together(tasks: Sequence[SubmapTask], kind: str, made: _Survey) -> OptimisedMap:

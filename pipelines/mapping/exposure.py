@@ -19,7 +19,7 @@ STRIDE = 4
 """Stride of the pixels that are used, in both directions."""
 SOLID = 0.9
 """Of what the map covers less, its colours say nothing yet."""
-LEAST = 100
+MIN_PIXELS = 100
 """Pixels without which the exposure stays as it was."""
 OUTLIER = 0.02
 """Difference of colours (0..1) from which a pixel counts the less the larger it is: light and shade on what is wrong in
@@ -30,7 +30,7 @@ for the offset: exposures are relative, and drift together with the map's colour
 less contrast than its photo, so that gains fall from keyframe to keyframe; a pull in colours of the map, whose contrast
 then grows, would lose hold of it (on a walk of 20 minutes gains fell to the limit, and the map by 15 dB). On a surface
 of one colour gain and offset say the same."""
-MOST_GAIN = 5.0
+MAX_GAIN = 5.0
 
 
 @torch.no_grad()
@@ -45,7 +45,7 @@ def fit_exposure(shown: Tensor, photo: Tensor, known: Tensor, exposure: Tensor) 
     """
     part = (slice(None, None, STRIDE),) * 2
     use = known[part].reshape(-1, 1).double()
-    enough = use.sum() >= LEAST
+    enough = use.sum() >= MIN_PIXELS
     if exposure.device.type == "cpu" and not enough:  # a card would make the host wait for the answer
         return exposure
     x, y = (colors[part].reshape(-1, 3).double() for colors in (shown, photo))
@@ -55,7 +55,7 @@ def fit_exposure(shown: Tensor, photo: Tensor, known: Tensor, exposure: Tensor) 
     mean_x, mean_y = (weight * x).sum(0), (weight * y).sum(0)
     variance = (weight * (x - mean_x) ** 2).sum(0)
     gain = (weight * (x - mean_x) * (y - mean_y)).sum(0) / variance.clamp(min=1e-12)
-    gain = gain.clamp(1 / MOST_GAIN, MOST_GAIN)
+    gain = gain.clamp(1 / MAX_GAIN, MAX_GAIN)
     told = gain**2 * variance
     log_gain = gain.log() * told / (told + RIDGE)
     found = torch.stack([log_gain, (mean_y - log_gain.exp() * mean_x) / (1 + RIDGE)]).to(exposure)

@@ -18,7 +18,7 @@ from ..system.progress import Progress
 from ..types import Trajectory
 from .move_map import move_map, rows_of
 from .optimise import optimise_map
-from .submap_tasks import SubmapResult, SubmapTask, pixels_filled, together
+from .submap_tasks import SubmapResult, SubmapTask, concatenate, pixels_filled
 from .views import View
 
 GROWN = "grown"
@@ -50,7 +50,7 @@ def grow_submap(task: SubmapTask, progress: Progress) -> None:
         exposure=(gains[visited], offsets[visited]), seeding=True,
     )  # fmt: skip
     poses[visited], gains[visited], offsets[visited] = made.cam_from_world, made.log_gains, made.offsets
-    grown = together([kept.only(~shown), made.gaussian_map])
+    grown = concatenate([kept.only(~shown), made.gaussian_map])
     task.save(GROWN, SubmapResult(grown, ids, poses, gains, offsets, no_depths, np.array([made.iterations])))
 
 

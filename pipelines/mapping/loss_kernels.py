@@ -163,8 +163,8 @@ def color_errors(
 def fit_color(
     shown: tl.tensor, stride: tl.tensor, silhouette: tl.tensor, photo: tl.tensor, scene: tl.tensor,
     exposure: tl.tensor, width: tl.tensor, height: tl.tensor,
-    STRIDE: tl.constexpr, SOLID: tl.constexpr, LEAST: tl.constexpr, OUTLIER: tl.constexpr, RIDGE: tl.constexpr,
-    MOST_GAIN: tl.constexpr, MASKED: tl.constexpr, BLOCK: tl.constexpr,
+    STRIDE: tl.constexpr, SOLID: tl.constexpr, MIN_PIXELS: tl.constexpr, OUTLIER: tl.constexpr, RIDGE: tl.constexpr,
+    MAX_GAIN: tl.constexpr, MASKED: tl.constexpr, BLOCK: tl.constexpr,
 ) -> None:  # fmt: skip
     """`exposure.fit_exposure` of one colour, in place; one program sees all pixels that tell, so that sums are those of
     one order."""
@@ -198,10 +198,10 @@ def fit_color(
     mean_x, mean_y = tl.sum(sum_x, axis=0) / weights, tl.sum(sum_y, axis=0) / weights
     variance = tl.maximum(tl.sum(sum_xx, axis=0) / weights - mean_x * mean_x, 0.0)
     together = tl.sum(sum_xy, axis=0) / weights - mean_x * mean_y
-    slope = tl.minimum(tl.maximum(together / tl.maximum(variance, 1e-12), 1 / MOST_GAIN), MOST_GAIN)
+    slope = tl.minimum(tl.maximum(together / tl.maximum(variance, 1e-12), 1 / MAX_GAIN), MAX_GAIN)
     certain = slope * slope * variance
     log_gain = tl.log(slope) * certain / (certain + RIDGE)
     new_offset = (mean_y - tl.exp(log_gain) * mean_x) / (1 + RIDGE)
-    enough = tl.sum(used, axis=0) >= LEAST
+    enough = tl.sum(used, axis=0) >= MIN_PIXELS
     tl.store(exposure + color, tl.where(enough, log_gain.to(tl.float32), old_gain))
     tl.store(exposure + 3 + color, tl.where(enough, new_offset.to(tl.float32), old_offset))

@@ -13,7 +13,7 @@ from ..compute.ssim import C1, C2, TAPS, WINDOW
 from ..config import MappingConfig
 from ..render.api import Rendering
 from . import losses
-from .exposure import LEAST, MOST_GAIN, OUTLIER, RIDGE, SOLID, STRIDE
+from .exposure import MAX_GAIN, MIN_PIXELS, OUTLIER, RIDGE, SOLID, STRIDE
 from .losses import NU, SIZE_LIMIT, SSIM_WEIGHT, photo_loss
 from .views import View
 
@@ -85,7 +85,7 @@ def fit_exposure_on_card(rendering: Rendering, view: View, exposure: Tensor) -> 
     height, width = rendering.silhouette.shape
     shown, silhouette = rendering.features.detach(), rendering.silhouette.detach().contiguous()
     given = (shown, shown.shape[-1], silhouette, view.image, _mask(view), exposure, width, height)
-    rules = {"SOLID": SOLID, "LEAST": LEAST, "OUTLIER": OUTLIER, "RIDGE": RIDGE, "MOST_GAIN": MOST_GAIN}
+    rules = {"SOLID": SOLID, "MIN_PIXELS": MIN_PIXELS, "OUTLIER": OUTLIER, "RIDGE": RIDGE, "MAX_GAIN": MAX_GAIN}
     gpu.launch(fit_color, 3, *given, STRIDE=STRIDE, **rules, MASKED=view.scene is not None, BLOCK=1024)
 
 

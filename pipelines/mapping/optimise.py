@@ -28,7 +28,7 @@ from .views import View, halved
 
 _FLOOR = 1 / (math.exp(SEED_LOGIT) - 1)
 """Added to every share of a class: one that has all votes gets the logit of a seed's own class, one without any 0."""
-_LEAST = 1e-6
+_MIN_VOTES = 1e-6
 """Pixels: who has less of all views keeps the classes that he has."""
 
 T = TypeVar("T")
@@ -241,7 +241,7 @@ def voted_logits(gaussian_map: GaussianMap, posed: Iterable[tuple[View, Tensor]]
         votes.index_add_(0, *class_weights(*seen, view.channels, view.label_weight, classes))
     total = votes.sum(1, keepdim=True)
     # In place: a number for each class and Gaussian is a large table.
-    votes.div_(total.clamp(min=_LEAST)).div_(_FLOOR).log1p_()
-    unseen = total[:, 0] <= _LEAST
+    votes.div_(total.clamp(min=_MIN_VOTES)).div_(_FLOOR).log1p_()
+    unseen = total[:, 0] <= _MIN_VOTES
     votes[unseen] = gaussian_map.class_logits[unseen]
     return votes

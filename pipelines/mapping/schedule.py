@@ -23,7 +23,7 @@ DENSIFY_EVERY, DENSIFY_UNTIL = 2, 0.45
 RATE_DECAY = 0.03
 """Learning rates at the end, as a share of those at the start. 0.06 shows more on two stretches of eight keyframes, and
 0.9 dB less on the whole of replica, where 77 views pull in turn at each Gaussian."""
-LEAST_SHOWN = 0.5
+MIN_SHOWN = 0.5
 """What is left out of the images is made up for by more visits, but by no more than twice as many: a place is visited
 as often as if nobody had covered it. A walk of 45 frames with somebody on a fifth of it comes 0.20 dB nearer to
 the same walk without her with her outline given, 0.41 dB with that of the networks."""
@@ -84,7 +84,7 @@ class Schedule:
         `first_rate`: learning rates of the first visit; below 1 the map only settles, and keeps its Gaussians."""
         # Read once: views may be on disk.
         reliability, shares = np.array([(float(v.trust.mean()), v.shown) for v in views]).T
-        shown = max(float(shares.mean()), LEAST_SHOWN)
+        shown = max(float(shares.mean()), MIN_SHOWN)
         visits = round((settings.passes if passes is None else passes) * len(views) / shown)
         if passes is None:
             visits = max(visits, settings.min_iterations)

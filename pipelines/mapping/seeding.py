@@ -18,7 +18,7 @@ SEED_RADIUS = 0.7
 """Radius of a seed in units of the distance between seeds on the image: neighbours then overlap without blurring."""
 SEED_LOGIT = 3.0
 """Logit of a seed's own class against 0 for the others."""
-LEAST_DETAIL = 8.0
+MIN_DETAIL = 8.0
 """Colours that differ by less, of 255, are no detail however little else there is."""
 
 
@@ -117,7 +117,7 @@ def seed_spacing(
         _refill(out, flat, side, float(side), side // 2)
     if fine_share > 0 and stride > 1:
         cells = _cells(detail, stride)
-        fine = cells > max(float(np.quantile(cells, 1 - fine_share)), LEAST_DETAIL)
+        fine = cells > max(float(np.quantile(cells, 1 - fine_share)), MIN_DETAIL)
         _refill(out, fine, stride, 1.0, None)
     return out
 

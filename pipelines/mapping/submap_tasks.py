@@ -147,7 +147,7 @@ def join_submap(task: SubmapTask, progress: Progress) -> None:
     m = own.gaussian_map
     best = nearest_seeing(m.means.cpu().double().numpy(), progress.track(views, "joining", len(views)))
     anchors = np.where(best >= 0, ids[best], m.anchor_frame_ids.cpu().numpy())
-    task.save(JOINED, replace(own, gaussian_map=belonging(m, anchors, task.submap), depths=own.depths[:0]))
+    task.save(JOINED, replace(own, gaussian_map=select_own(m, anchors, task.submap), depths=own.depths[:0]))
 
 
 def _in_common_exposure(task: SubmapTask, result: SubmapResult) -> SubmapResult:
@@ -167,7 +167,7 @@ def refine_submap(task: SubmapTask, progress: Progress) -> None:
     if task.file(REFINED).exists():
         return
     beside = (task.number, *task.submap.beside)
-    ids, poses, (gains, offsets) = in_order([task.load(JOINED, n).without_map for n in beside])
+    ids, poses, (gains, offsets) = merge_results([task.load(JOINED, n).without_map for n in beside])
     rows = np.searchsorted(ids, task.trajectory.frame_ids)
     given = task.views(replace(task.trajectory, cam_from_world=poses[rows]))
     shown, places, weights = _shown(given.views, [task.load(JOINED, n).gaussian_map for n in beside])
@@ -180,13 +180,13 @@ def _shown(
 ) -> tuple[GaussianMap, NDArray[np.int64], NDArray[np.float32]]:
     """What the views show of the maps, as one: its Gaussians, their rows in the maps they are from (M,), and how many
     pixels each fills (M,). One map alone is all that they show."""
-    whole, places = together(maps), torch.cat([torch.arange(len(m)) for m in maps])
+    whole, places = concatenate(maps), torch.cat([torch.arange(len(m)) for m in maps])
     weights = pixels_filled(whole, views) if len(maps) > 1 else torch.ones(len(whole), device=whole.means.device)
     shown = weights > 0
     return whole.only(shown), places[shown.cpu()].numpy(), weights[shown].cpu().numpy()
 
 
-def agree_submap(task: SubmapTask, progress: Progress) -> None:
+def average_overlap(task: SubmapTask, progress: Progress) -> None:
     """Each of its Gaussians as those who show it have refined it, on average, weighed by the pixels that it fills.
 
     So every view has its say about all that it shows, although no task has seen all views (consensus, as of models that
@@ -210,12 +210,12 @@ def agree_submap(task: SubmapTask, progress: Progress) -> None:
 
 
 STEPS: dict[str, Callable[[SubmapTask, Progress], None]] = {
-    MADE: make_submap, JOINED: join_submap, REFINED: refine_submap, AGREED: agree_submap,
+    MADE: make_submap, JOINED: join_submap, REFINED: refine_submap, AGREED: average_overlap,
 }  # fmt: skip
 """Which task leaves which kind of result; each needs those before it, of its own submap and those beside."""
 
 
-def in_order(results: Sequence[SubmapResult]) -> tuple[NDArray[np.int64], NDArray[np.float64], Exposures]:
+def merge_results(results: Sequence[SubmapResult]) -> tuple[NDArray[np.int64], NDArray[np.float64], Exposures]:
     """Ids, poses and exposures of all their keyframes, by id."""
     ids = np.concatenate([r.frame_ids for r in results])
     order = np.argsort(ids)
@@ -228,7 +228,7 @@ def measure_submap(task: SubmapTask, progress: Progress) -> tuple[list[ViewFigur
     maps = [task.load(task.measured, n).gaussian_map for n in (task.number, *task.submap.beside)]
     given = task.views(task.trajectory, task.config.mapping.hold_out)
     rows = {int(i): row for row, i in enumerate(task.trajectory.frame_ids)}
-    whole = together(maps)
+    whole = concatenate(maps)
     log_gains, offsets = task.exposure or _no_exposure(len(rows))
 
     def figures(view: View) -> ViewFigures:
@@ -286,7 +286,7 @@ def _posed(results: Iterable[SubmapResult], full: Intrinsics) -> list[PosedDepth
     ]
 
 
-def belonging(gaussian_map: GaussianMap, anchors: NDArray[np.int64], submap: Submap) -> GaussianMap:
+def select_own(gaussian_map: GaussianMap, anchors: NDArray[np.int64], submap: Submap) -> GaussianMap:
     """The Gaussians that are anchored (M,) at the submap's own keyframes."""
     kept = torch.from_numpy(np.isin(anchors, submap.own)).to(gaussian_map.means.device)
     anchored = replace(gaussian_map, anchor_frame_ids=torch.from_numpy(anchors).to(gaussian_map.means.device))
@@ -302,7 +302,7 @@ def pixels_filled(gaussian_map: GaussianMap, views: Iterable[View]) -> Tensor:
     return filled
 
 
-def together(maps: Iterable[GaussianMap]) -> GaussianMap:
+def concatenate(maps: Iterable[GaussianMap]) -> GaussianMap:
     """One map of all, which are not held longer than they are needed where nobody else does."""
     parts = [dict(vars(m)) for m in maps]
     return GaussianMap(**{name: torch.cat([part.pop(name) for part in parts]) for name in list(parts[0])})

@@ -20,7 +20,7 @@ from .tracking import track
 Array = NDArray[np.float64]
 GAP = 8
 """A loop joins keyframes at least this many apart."""
-_LEAST_COVERED, _MOST_LOSS = 0.5, 1.5
+_MIN_COVERED, _MAX_LOSS = 0.5, 1.5
 """A loop's place must be covered so far by the map around the other end, and (16) be at most so many times that of a
 neighbour."""
 
@@ -81,7 +81,7 @@ def close(
         start = torch.from_numpy(poses[i])
         own = track(near, view_of(i), [start], classes, unit, seed)
         found = track(near, view_of(j), [start, torch.from_numpy(poses[j])], classes, unit, seed)
-        if found.covered > _LEAST_COVERED and found.loss < _MOST_LOSS * own.loss:
+        if found.covered > _MIN_COVERED and found.loss < _MAX_LOSS * own.loss:
             motion = found.cam_from_world.numpy() @ se3.inverse(poses[i])
             loops.append(LoopEdge(int(ids[i]), int(ids[j]), motion, 1.0, int(found.covered * 1000)))
     return loops

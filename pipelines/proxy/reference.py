@@ -38,10 +38,10 @@ _HOW = (
     "IMAGE:X1,Y1,X2,Y2=METRES (two pixels of one image of the source), height=METRES (camera over the floor) or "
     "poses (those given with --poses)"
 )
-_LEAST_APART = 8.0
+_MIN_APART = 8.0
 _KEYFRAMES = 5
 _PATCH = 2
-_LEAST_CONFIDENCE = 0.3
+_MIN_CONFIDENCE = 0.3
 _PIXEL_SD = 1.0
 """How exactly a person points at a pixel of the proxy maps."""
 
@@ -73,7 +73,7 @@ def parse_reference(text: str) -> Reference | None:
     if not (found := _DISTANCE.fullmatch(text.strip())):
         raise InputError(f"--scale-ref {text}: expected {_HOW}")
     x1, y1, x2, y2 = (_number(found[k], text) for k in range(2, 6))
-    if np.hypot(x2 - x1, y2 - y1) < _LEAST_APART:
+    if np.hypot(x2 - x1, y2 - y1) < _MIN_APART:
         raise InputError(f"--scale-ref {text}: the two pixels are nearly the same; take points farther apart")
     return Reference(_positive(found[6], text), found[1].strip(), ((x1, y1), (x2, y2)))
 
@@ -163,7 +163,7 @@ def _length(points: Array, estimate: DepthEstimate, camera: Intrinsics) -> float
     for x, y in points.tolist():
         rows = slice(max(int(y) - _PATCH, 0), int(y) + _PATCH + 1)
         columns = slice(max(int(x) - _PATCH, 0), int(x) + _PATCH + 1)
-        sure = estimate.depth[rows, columns][estimate.confidence[rows, columns] >= _LEAST_CONFIDENCE]
+        sure = estimate.depth[rows, columns][estimate.confidence[rows, columns] >= _MIN_CONFIDENCE]
         if x < 0 or y < 0 or len(sure) < _PATCH**2:
             return None
         depths.append(float(np.median(sure)))

@@ -116,12 +116,12 @@ def content_digest(files: Mapping[str, tuple[int, str]]) -> str:
     return hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()
 
 
-def plain(figures: Any) -> Any:
+def finite_or_none(figures: Any) -> Any:
     """Replace numbers that JSON lacks (infinite, NaN) by None, at any depth."""
     if isinstance(figures, dict):
-        return {k: plain(v) for k, v in figures.items()}
+        return {k: finite_or_none(v) for k, v in figures.items()}
     if isinstance(figures, list | tuple):
-        return [plain(v) for v in figures]
+        return [finite_or_none(v) for v in figures]
     return None if isinstance(figures, float) and not math.isfinite(figures) else figures
 
 

@@ -19,7 +19,7 @@ FORMAT = "msgs-slam camera path 1"
 EXPORTED, RUN = "exported", "run"
 """Worlds of a path: that of the exported files (or of the splat file), or that of a run without an export."""
 _LIMITS = {"fps": (0.1, 240.0), "seconds_per_keyframe": (0.05, 600.0), "fov_degrees": (1.0, 170.0)}
-_MOST_KEYFRAMES, _MOST_IMAGES = 1000, 100_000
+_MAX_KEYFRAMES, _MAX_IMAGES = 1000, 100_000
 _AGAIN = "correct it, or record the path again in `msgs-slam view`"
 
 
@@ -88,15 +88,15 @@ def read_camera_path(path: Path, fps: float | None = None) -> CameraPath:
     if (world := value.get("world")) not in (EXPORTED, RUN):
         raise InputError(f"{path}: world is {str(world)[:40]!r}, expected {EXPORTED!r} or {RUN!r}: {_AGAIN}")
     rows = value.get("keyframes")
-    if not isinstance(rows, list) or not 2 <= len(rows) <= _MOST_KEYFRAMES:
+    if not isinstance(rows, list) or not 2 <= len(rows) <= _MAX_KEYFRAMES:
         count = len(rows) if isinstance(rows, list) else "no list of"
-        raise InputError(f"{path} has {count} keyframes, expected 2 to {_MOST_KEYFRAMES}: {_AGAIN}")
+        raise InputError(f"{path} has {count} keyframes, expected 2 to {_MAX_KEYFRAMES}: {_AGAIN}")
     keyframes = tuple(_keyframe(path, i, row) for i, row in enumerate(rows, 1))
     rate, seconds = fps or _limited(value, path, "fps"), _limited(value, path, "seconds_per_keyframe")
     found_path = CameraPath(keyframes, rate, seconds, str(world))
-    if (count := found_path.image_count()) > _MOST_IMAGES:
+    if (count := found_path.image_count()) > _MAX_IMAGES:
         raise InputError(
-            f"{path}: the flight has {count:,} images, at most {_MOST_IMAGES:,}: "
+            f"{path}: the flight has {count:,} images, at most {_MAX_IMAGES:,}: "
             "lower fps or seconds_per_keyframe, or split the path"
         )
     return found_path

@@ -20,7 +20,7 @@ _SHOWING = {
 }  # fmt: skip
 
 
-def standing(run: RunFolder) -> str:
+def progress_summary(run: RunFolder) -> str:
     """Say in a line what is shown of a run and what is still to come; "" for a finished one."""
     records = load_records(run)
     left = [name for name in STAGES if name not in records]
@@ -35,15 +35,15 @@ def standing(run: RunFolder) -> str:
     return f"Shown: {shown} ({len(STAGES) - len(left)} of {len(STAGES)} stages done). Still to come: {what}."
 
 
-class Watch:
-    """Looks at a run every other second until it is finished: `tell` gets its standing, `show` its scenes when a stage
+class RunWatcher:
+    """Looks at a run every other second until it is finished: `tell` gets its progress, `show` its scenes when a stage
     has ended that changes them."""
 
     def __init__(self, run: RunFolder, tell: Callable[[str], None], show: Callable[[list[ViewerScene]], None]) -> None:
         self._run, self._tell, self._show = run, tell, show
         self._seen = self._shown_stages()
         self._stop = threading.Event()
-        self._tell(standing(run))
+        self._tell(progress_summary(run))
         if len(load_records(run)) < len(STAGES):
             threading.Thread(target=self._watch, daemon=True).start()
 
@@ -69,7 +69,7 @@ class Watch:
         if stages != self._seen:
             self._show(load_scenes(self._run.root))
             self._seen = stages
-        self._tell(standing(self._run))
+        self._tell(progress_summary(self._run))
 
     def _shown_stages(self) -> dict[str, str]:
         """Stage → digest of its files, of all whose results are shown."""

@@ -40,7 +40,7 @@ _FROM_OUTSIDE = 1.4
 KINDS = ("color", "depth", "labels", "side-by-side")
 PATHS = ("own", "smooth", "orbit")
 _SMOOTHING_SECONDS = 0.5
-_MOST_GAP, _MOST_OF_PHOTOS = 1.0, 60.0
+_MAX_GAP, _MAX_OF_PHOTOS = 1.0, 60.0
 """Seconds of film between two neighbouring frames, and of a film along photos, which may be days apart."""
 _FILE_SUFFIX = re.compile(r"\.[a-z][a-z0-9]{1,4}")
 _FILE_SIZE, _FIELD_OF_VIEW = (960, 540), 50.0
@@ -237,8 +237,8 @@ def film_seconds(times: NDArray[np.float64]) -> float:
     """Length in seconds of a film along frames taken at `times` (N,) seconds: their own, without gaps above a second;
     of photos, which have such gaps throughout, at most a minute."""
     gaps = np.diff(times)
-    seconds = float(np.minimum(gaps, _MOST_GAP).sum())
-    return min(seconds, _MOST_OF_PHOTOS) if np.median(gaps) >= _MOST_GAP else seconds
+    seconds = float(np.minimum(gaps, _MAX_GAP).sum())
+    return min(seconds, _MAX_OF_PHOTOS) if np.median(gaps) >= _MAX_GAP else seconds
 
 
 def _depth_range(outcome: Outcome) -> tuple[float, float]:

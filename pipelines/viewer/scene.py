@@ -32,7 +32,7 @@ from .camera_path import EXPORTED, RUN
 Array = NDArray[np.float64]
 
 MODES = ("colour", "classes", "depth")
-MOST_CAMERAS = 60
+MAX_CAMERAS = 60
 GAUSSIANS, POINTS = "Gaussians", "points"
 _POINT_RADIUS = 0.012
 """Of a scene as shown."""
@@ -149,7 +149,7 @@ def _from_run(outcome: Outcome) -> ViewerScene:
     t, k = outcome.trajectory, outcome.calibration.intrinsics
     centers = t.centers[t.is_posed]
     scale = _scale(cloud.means, centers)
-    rows = [outcome.frame_row(i) for i in spread_sample(t.frame_ids[t.is_keyframe].tolist(), MOST_CAMERAS)]
+    rows = [outcome.frame_row(i) for i in spread_sample(t.frame_ids[t.is_keyframe].tolist(), MAX_CAMERAS)]
     world_from_cam = t.world_from_cam
     channels = decided_channels(m.class_logits).cpu().numpy()
     return ViewerScene(
@@ -212,7 +212,7 @@ def _of_points(
     if not cameras:
         return shown
     frames, k = run.load(FRAMES), run.load(CALIBRATION).intrinsics
-    seen = [ViewerCamera.of(frames[i], pose, k) for i, pose in spread_sample(cameras, MOST_CAMERAS)]
+    seen = [ViewerCamera.of(frames[i], pose, k) for i, pose in spread_sample(cameras, MAX_CAMERAS)]
     return replace(shown, cameras=seen)
 
 

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from ...formats.errors import InputError, install_command
 from ..export.extra.floor_plan import walls_of_run
 from ..source.sharpness import at_most_wide
-from .door import guard_server
 from .flight import Flight
-from .live import Watch
+from .live import RunWatcher
+from .request_guard import guard_server
 from .scene import MODES, POINTS, ViewerCamera, ViewerScene, client_view, load_scenes, move_client, shown_pose
 from .tools import Selection, Tape, class_name, length_text, unit_text
 
@@ -56,7 +56,9 @@ def open_viewer(path: Path, host: str = "127.0.0.1", port: int = 8080) -> Viewer
         raise InputError(f"the viewer needs viser: {install_command('msgs-slam[viewer]')}") from error
     try:
         with guard_server(host):
-            server = viser.ViserServer(host=host, port=port, label=f"MSGS-SLAM {plain(scenes[0].title)}", verbose=False)
+            server = viser.ViserServer(
+                host=host, port=port, label=f"MSGS-SLAM {strip_markup(scenes[0].title)}", verbose=False
+            )
     except OSError as error:
         raise InputError(f"port {port} cannot be used ({error.strerror}): choose another with --port") from error
     return Viewer(server, scenes)
@@ -68,7 +70,7 @@ class Viewer:
 
     def __init__(self, server: Any, scenes: list[ViewerScene]) -> None:
         self.server, self.scenes = server, scenes
-        self.watch: Watch | None = None
+        self.watch: RunWatcher | None = None
         self._told = ""
         server.gui.configure_theme(show_logo=False)
         self.boxes: dict[str, Any] = {}
@@ -79,7 +81,7 @@ class Viewer:
         self._add_tools()
         server.on_client_connect(self._place)
         if (run := scenes[0].run) is not None:
-            self.watch = Watch(run, self.tell, self.replace)
+            self.watch = RunWatcher(run, self.tell, self.replace)
 
     def _load(self, scene: ViewerScene) -> None:
         """Everything of the scene, and nothing else."""
@@ -184,7 +186,7 @@ class Viewer:
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        titles = [f"{plain(s.title)}: {0 if s.is_empty else len(s.centers):,} {s.what}" for s in self.scenes]
+        titles = [f"{strip_markup(s.title)}: {0 if s.is_empty else len(s.centers):,} {s.what}" for s in self.scenes]
         if len(titles) == 1:
             gui.add_markdown("**{}**: {}".format(*titles[0].rsplit(": ", 1)))
         else:
@@ -259,7 +261,7 @@ class Viewer:
         try:
             walls = walls_of_run(self.scene.run) if self.scene.run is not None else []
         except InputError as error:
-            self.server.gui.add_markdown(plain(str(error)))
+            self.server.gui.add_markdown(strip_markup(str(error)))
             self.boxes["Floor plan"].value = False
             return
         top = float(np.quantile(self.scene.cloud.means[:, 2], 0.99))
@@ -287,12 +289,12 @@ class Viewer:
             if self.mode.value == "depth":
                 self.show("depth", client)
         if self.scene.run is not None:
-            label = f"{plain(camera.frame.name)}, {camera.frame.timestamp:.2f} s"
+            label = f"{strip_markup(camera.frame.name)}, {camera.frame.timestamp:.2f} s"
             try:
                 self.preview.image = at_most_wide(self.scene.run.image(camera.frame), _PREVIEW_WIDTH)
                 self.preview.visible = True
             except InputError as error:  # this frame alone: what else is shown was checked
-                label = plain(str(error))
+                label = strip_markup(str(error))
             self.preview.label = label
 
     @_alone
@@ -343,11 +345,12 @@ def legend_html(scene: ViewerScene) -> str:
             f"<span style='display:inline-block;width:12px;height:12px;border-radius:3px;background:{color}'></span>"
         )
         rows.append(
-            f"<div>{swatch} {plain(class_name(scene, label))} {100 * counts[label] / len(scene.labels):.0f} %</div>"
+            f"<div>{swatch} {strip_markup(class_name(scene, label))} "
+            f"{100 * counts[label] / len(scene.labels):.0f} %</div>"
         )
     return f"<div style='font-size:0.8em;padding:0 0.75em 0.5em'>{''.join(rows)}</div>"
 
 
-def plain(name: str) -> str:
+def strip_markup(name: str) -> str:
     """A name without what Markdown, HTML or the page's scripts could take for their own."""
     return re.sub(r"[^\w .,()-]", "?", name)

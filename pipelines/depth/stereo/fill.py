@@ -23,7 +23,7 @@ _LIGHT = 0.5
 """A difference in lightness counts so much: exposure and shading change it from view to view."""
 _AGREE = 0.02
 _IN_FRONT = 0.98
-_LEAST = 0.5
+_MIN_MASS = 0.5
 """Likeness of colour that the agreeing views must have together; a view of the same colour counts 1. By the depth of
 six rooms' proxies 1.0 is 1 to 4 % worse on three and 0.2 % better on three; of three, 0.25 is 1 % worse on two."""
 _BORROWED_CONFIDENCE = 0.35
@@ -45,13 +45,13 @@ _ANYWHERE, _ANYWHERE_REACH = 1e-5, 1 / 4
 a fourth of it on, the blur (OpenCV cuts it off at four standard deviations) reaches from any pixel to any other."""
 _RIDGE = 3e-4
 """Variance of place, in longer sides squared, below which the evidence does not fix a slope: then it is kept small."""
-_LEAST_SLOPE, _MOST_SLOPE = 0.5, 1.6
-_LEAST_PIXELS = 40
+_MIN_SLOPE, _MAX_SLOPE = 0.5, 1.6
+_MIN_PIXELS = 40
 _FLAT_CONFIDENCE, _GUESS_CONFIDENCE = 0.2, 0.03
 _KNOWN_MASS = 1e-3
 
 
-def judge_by_company(confidence: NDArray[np.float32], image: NDArray[np.uint8]) -> NDArray[np.float32]:
+def smooth_confidence(confidence: NDArray[np.float32], image: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(h, w) confidence that also counts how sure the pixels around are that have a like colour; image (h, w, 3)."""
     both = np.stack([confidence, np.ones_like(confidence)], axis=-1)
     total, mass = np.moveaxis(spread_votes(both, image, _COMPANY_REACH * max(confidence.shape), _COMPANY_SD), -1, 0)
@@ -63,20 +63,20 @@ def evidence_of(contrast: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.power(contrast / (contrast + np.float32(_FAINT)), np.float32(_POWER))
 
 
-def prefer_matches(
+def restore_supported_matches(
     filled: NDArray[np.float32],
     matched: NDArray[np.float32],
-    borne_out: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+    support: Callable[[NDArray[np.float32]], NDArray[np.float32]],
     contrast: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """(h, w) filled depths, and matched ones (0 where none) where `borne_out` (agreeing less contradicting views)
+    """(h, w) filled depths, and matched ones (0 where none) where `support` (agreeing less contradicting views)
     is larger for them and there was something to match; it is asked of no other pixels, which are 0.
 
     What lies beside a near thing is seen by too few views to be sure, and a plane through what is sure would draw the
     near thing over it.
     """
     asked = (matched > 0) & (contrast > _CLEAR)
-    better = borne_out(np.where(asked, matched, 0)) > borne_out(np.where(asked, filled, 0))
+    better = support(np.where(asked, matched, 0)) > support(np.where(asked, filled, 0))
     return np.where(asked & better, matched, filled)
 
 
@@ -85,7 +85,7 @@ def fill_unsure(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(h, w) depth and confidence with every unsure depth replaced by a guess of low confidence; image (h, w, 3)."""
     sure = (confidence >= SURE) & (depth > 0)
-    if sure.sum() < _LEAST_PIXELS:
+    if sure.sum() < _MIN_PIXELS:
         return depth, np.minimum(confidence, SURE)
     weight = np.where(depth > 0, confidence, 0).astype(np.float64) ** _EVIDENCE_POWER
     inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0)
@@ -121,7 +121,7 @@ def _local_planes(inverse: Array, weight: Array, image: NDArray[np.uint8]) -> tu
     determinant = xx * yy - xy * xy
     slope_x, slope_y = (yy * xv - xy * yv) / determinant, (xx * yv - xy * xv) / determinant
     plane = mean + slope_x * (x - mx) + slope_y * (y - my)
-    return np.clip(plane, _LEAST_SLOPE * mean, _MOST_SLOPE * mean), mass
+    return np.clip(plane, _MIN_SLOPE * mean, _MAX_SLOPE * mean), mass
 
 
 def _spread_anywhere(votes: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -133,14 +133,14 @@ def _spread_anywhere(votes: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def borrow_depth(
+def propagate_depth(
     depth: NDArray[np.float32],
     confidence: NDArray[np.float32],
     lent: NDArray[np.float32],
     mass: NDArray[np.float32],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(h, w) depth and confidence with the unsure ones taken from what the others agree on, as `agreed_depth` says."""
-    taken = (confidence < SURE) & (mass > _LEAST)
+    taken = (confidence < SURE) & (mass > _MIN_MASS)
     return np.where(taken, lent, depth), np.where(taken, np.float32(_BORROWED_CONFIDENCE), confidence)
 
 

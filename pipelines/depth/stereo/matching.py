@@ -14,7 +14,7 @@ from .smoothing import smooth_cost
 from .sweep import refine_inverse_depth, sweep_cost
 from .volume import TILE, Bands, least_planes, pick_planes, tiles_of
 
-LEAST_BEST, MOST_BEST = 3, 5
+MIN_BEST, MAX_BEST = 3, 5
 """Of the views that one is matched with, the better half counts at a pixel, but not fewer or more than these."""
 SMALL_STEP, JUMP, EDGE = 0.1, 1.2, 0.05
 """Of the smoothing: a plane more or less, any other step, and the intensity step that makes it cheap."""
@@ -111,4 +111,4 @@ def planes_to_try(
 
 def best_count(views: int) -> int:
     """Return how many of so many views count at a pixel: the others may not see it."""
-    return min(MOST_BEST, max(LEAST_BEST, views // 2))
+    return min(MAX_BEST, max(MIN_BEST, views // 2))

@@ -13,8 +13,8 @@ _UNSEEN_WEIGHT = 0.3
 _NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5
 """What is plain has no points: a near sofa may stand well before the nearest of them, and beyond the range nothing can
 be found."""
-_LEAST_POINTS = 12
-_MOST_CANDIDATES = 128
+_MIN_POINTS = 12
+_MAX_CANDIDATES = 128
 """So many that share points, and so many of the nearest, are compared: a longer recording has no better ones."""
 
 
@@ -56,8 +56,8 @@ def choose_neighbours(
 def _candidates(model: SparseModel, index: int) -> NDArray[np.int64]:
     """Sorted indices of the keyframes worth a look: those that share most points, and the nearest ones."""
     shared = np.asarray(model.seen_by[model.points_of(index)].sum(0)).ravel()
-    sharing = np.argsort(-shared, kind="stable")[:_MOST_CANDIDATES]
-    nearest = model.tree.query(model.centers[index], min(_MOST_CANDIDATES, len(model.frame_ids)))[1]
+    sharing = np.argsort(-shared, kind="stable")[:_MAX_CANDIDATES]
+    nearest = model.tree.query(model.centers[index], min(_MAX_CANDIDATES, len(model.frame_ids)))[1]
     found = np.union1d(sharing[shared[sharing] > 0], nearest)
     return found[found != index]
 
@@ -74,9 +74,9 @@ def depth_range(model: SparseModel, index: int, companions: NDArray[np.int64]) -
         depths.append(z[z > 0])
     own = depths[0]
     every = np.concatenate(depths)
-    if len(every) < _LEAST_POINTS:
+    if len(every) < _MIN_POINTS:
         return None
-    trusted = own if len(own) >= 4 * _LEAST_POINTS else every
+    trusted = own if len(own) >= 4 * _MIN_POINTS else every
     near, far = np.percentile(trusted, [1, 99])
     # Companions may look at what lies behind a corner; let them widen the range, but not without bound.
     near = min(near, max(float(np.percentile(every, 2)), 0.5 * near))

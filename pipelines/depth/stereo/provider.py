@@ -27,12 +27,12 @@ from .consistency import fuse_depths
 from .fill import (
     SURE,
     agreed_depth,
-    borrow_depth,
     carry_depth,
     evidence_of,
     fill_unsure,
-    judge_by_company,
-    prefer_matches,
+    propagate_depth,
+    restore_supported_matches,
+    smooth_confidence,
 )
 from .matching import StereoImages, match_planes
 from .neighbours import choose_neighbours, depth_range
@@ -149,10 +149,10 @@ class MultiviewDepth:
         index = self._index[frame.id]
         borrowed, sure = self._borrow(index)
         filled, confidence = fill_unsure(borrowed, sure, self._small(index))
-        depth = self._prefer_matches(index, filled, sure < SURE)
+        depth = self._restore_supported(index, filled, sure < SURE)
         return upsample_depth(depth, confidence, self._sequence.image(frame))
 
-    def _prefer_matches(
+    def _restore_supported(
         self, index: int, filled: NDArray[np.float32], unsure: NDArray[np.bool_]
     ) -> NDArray[np.float32]:
         """The keyframe's own matches where the depths of others bear them out better than what was filled in."""
@@ -162,11 +162,11 @@ class MultiviewDepth:
         others = np.stack([self._fused(j)[0] for j in companions.tolist()])
         warps, back = self._warps(index, companions), self._rows_back(index, companions)
 
-        def borne_out(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        def support(depth: NDArray[np.float32]) -> NDArray[np.float32]:
             _, support, conflict = self._compare(np.where(unsure, depth, 0), others, warps, back, 2 * _TOLERANCE)
             return np.asarray(support - conflict)
 
-        return prefer_matches(filled, self._fused(index)[0], borne_out, self._contrast(index))
+        return restore_supported_matches(filled, self._fused(index)[0], support, self._contrast(index))
 
     def _borrow(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth and confidence of one keyframe, with sure depths of others where its own is unsure."""
@@ -175,7 +175,7 @@ class MultiviewDepth:
         for j in self._present(self._neighbours(index, _LENDERS)).tolist():
             warp = self._warps(j, np.array([index]))[0]
             carried.append(carry_depth(*self._fused(j), self._lab(j), warp, lab))
-        return borrow_depth(*own, *agreed_depth(carried, own[1] < SURE)) if carried else own
+        return propagate_depth(*own, *agreed_depth(carried, own[1] < SURE)) if carried else own
 
     def _fuse(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth of one keyframe and those of its neighbours that agree, and its confidence."""
@@ -187,7 +187,7 @@ class MultiviewDepth:
         warps, back = self._warps(index, companions), self._rows_back(index, companions)
         fused, support, conflict = self._compare(depth, others, warps, back, _TOLERANCE)
         confidence = agreement(support, conflict) * evidence_of(self._contrast(index))
-        return fused, judge_by_company(confidence, self._small(index))
+        return fused, smooth_confidence(confidence, self._small(index))
 
     def _compare(
         self,

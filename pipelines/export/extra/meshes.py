@@ -21,7 +21,7 @@ from .atlas import simplified
 USD = "mesh.usdz"
 
 COLLISION = "collision.glb"
-MOST_FACES = 20_000
+MAX_FACES = 20_000
 """Triangles that physics engines on the web and on phones take."""
 
 
@@ -50,7 +50,7 @@ def write_collision(outcome: Outcome, world: World, folder: Path) -> list[Path]:
     Raises InputError where the run has no mesh, or an empty one.
     """
     mesh = mesh_of_run(outcome, world)
-    light = simplified(mesh, MOST_FACES / len(mesh.faces)) if len(mesh.faces) > MOST_FACES else mesh
+    light = simplified(mesh, MAX_FACES / len(mesh.faces)) if len(mesh.faces) > MAX_FACES else mesh
     points = light.vertices.astype(np.float64)
     faces = light.faces
     if world.axes == "up" and world.has_floor:

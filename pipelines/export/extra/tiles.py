@@ -23,9 +23,9 @@ from ...scene.world import Z_UP_FROM_Y_DOWN, World
 Array = NDArray[np.float64]
 
 TILES, TILESET = "tiles", "tileset.json"
-MOST = 50_000
+MAX_GAUSSIANS = 50_000
 """Gaussians of a tile: half a megabyte."""
-_LEAST_BYTES = 16
+_MIN_BYTES = 16
 """That a Gaussian takes with what stands for it in coarser tiles; 21 in the rooms measured."""
 _COARSER = 1.25
 """By which the cells grow until a tile's Gaussians are few enough."""
@@ -33,7 +33,7 @@ _CELL = 3.0
 """Side of the smallest cells that become one Gaussian, in median radii."""
 _REACH = 3.0
 """Standard deviations of a Gaussian that lie in the tile's box."""
-_MOST_OPAQUE = 0.99
+_MAX_OPAQUE = 0.99
 _WIDEST = 0.5
 """Radius to which a merged Gaussian may grow, in sides of its cell."""
 
@@ -47,7 +47,7 @@ def write_tiles(outcome: Outcome, world: World, folder: Path) -> list[Path]:
     m = outcome.require_map()
     if len(m) == 0:
         return []
-    require_room(folder / TILES, _LEAST_BYTES * len(m))
+    require_room(folder / TILES, _MIN_BYTES * len(m))
     means, log_radii, logits, colors = (x.cpu().numpy() for x in (m.means, m.log_radii, m.opacity_logits, m.colors))
     cloud = isotropic_cloud((means @ world.image_axes_from_exported.T).astype(np.float32), log_radii, logits, colors)
     empty(target := folder / TILES)
@@ -72,7 +72,7 @@ def write_tiles(outcome: Outcome, world: World, folder: Path) -> list[Path]:
 def _write_tile(cloud: GaussianCloud, folder: Path, name: str) -> tuple[dict[str, Any], GaussianCloud]:
     """The tile of a cloud (x right, y down, z forward) as tileset.json has it, and what its own file holds."""
     children, held, error = [], cloud, 0.0
-    if len(cloud) > MOST:
+    if len(cloud) > MAX_GAUSSIANS:
         along = cloud.means[:, int(np.ptp(cloud.means, axis=0).argmax())]
         order = np.argsort(along, kind="stable")
         halves = [
@@ -95,9 +95,9 @@ def _write_tile(cloud: GaussianCloud, folder: Path, name: str) -> tuple[dict[str
 
 
 def _fewer(cloud: GaussianCloud, least: float) -> tuple[GaussianCloud, float]:
-    """At most `MOST` Gaussians, and the side of the cells, more than `least`, that each became one of them."""
+    """At most `MAX_GAUSSIANS` Gaussians, and the side of the cells, more than `least`, that each became one of them."""
     side = max(_CELL * float(np.median(np.exp(cloud.log_scales[:, 0]))), _COARSER * least)
-    while len(few := merged(cloud, side)) > MOST:
+    while len(few := merged(cloud, side)) > MAX_GAUSSIANS:
         side *= _COARSER
     return few, side
 
@@ -130,8 +130,8 @@ def merged(cloud: GaussianCloud, side: float) -> GaussianCloud:
     apart = np.square(cloud.means - center[cell]).sum(1) / 2  # they lie side by side on a surface, in two directions
     # A radius that cannot be opaque enough grows, but not over the cells beside it.
     radius = np.sqrt(mean(np.square(radii) + apart)[:, 0])
-    radius = np.maximum(radius, np.minimum(np.sqrt(total / _MOST_OPAQUE), _WIDEST * side))
-    covered = np.clip(total / radius**2, 1e-3, _MOST_OPAQUE)
+    radius = np.maximum(radius, np.minimum(np.sqrt(total / _MAX_OPAQUE), _WIDEST * side))
+    covered = np.clip(total / radius**2, 1e-3, _MAX_OPAQUE)
     logits, colors = np.log(covered / (1 - covered)).astype(np.float32), mean(cloud.colors).astype(np.float32)
     return isotropic_cloud(center.astype(np.float32), np.log(radius).astype(np.float32), logits, colors)
 

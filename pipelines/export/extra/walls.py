@@ -22,14 +22,14 @@ _STEPS = 60
 """Of the room's height: a wall is one thick, twice that where pictures hang on it."""
 _ROUGH = 0.03
 """Lengths that are less certain are approximate."""
-_LAYERS, _LEAST_LAYERS = 20, 8
+_LAYERS, _MIN_LAYERS = 20, 8
 """Of the room's height: a column of a wall shows so many."""
 _FITS = 8
-_LEAST_SHARE, _LEAST_AREA = 0.08, 0.045
+_MIN_SHARE, _MIN_AREA = 0.08, 0.045
 """A direction's area, of that of the strongest; a plane's, in squared heights of the room."""
 _BETWEEN, _COVERED = 0.5, 0.9
 """In heights of the room: the longest wall that is looked for between two ends; and how much of it has to be seen."""
-_SMALL_GAP, _GAP, _LEAST_LENGTH, _CORNER, _IN_FRONT = 0.1, 0.7, 0.3, 0.4, 0.35
+_SMALL_GAP, _GAP, _MIN_LENGTH, _CORNER, _IN_FRONT = 0.1, 0.7, 0.3, 0.4, 0.35
 """In heights of the room: openings and furniture that a wall goes on behind, shorter is no wall, ends that meet, and
 how far a cupboard stands before the wall that it hides."""
 
@@ -147,7 +147,7 @@ def _directions(faces: _Faces) -> list[float]:
         near = left & (np.abs(_between(half, peak)) < _APART)
         strength = float(faces.area[near].sum())
         first = first or strength
-        if strength < _LEAST_SHARE * first:
+        if strength < _MIN_SHARE * first:
             break
         angle = peak + float(np.average(_between(half[near], peak), weights=faces.area[near]))
         if found and abs(_between(angle, found[0] + np.pi / 2)) < _SQUARE:
@@ -167,7 +167,7 @@ def _strongest_line(faces: _Faces, angle: float) -> _Line:
     little."""
     step, normal = faces.height / _STEPS, np.array([np.cos(angle), np.sin(angle)])
     faces = faces.only(faces.facing(angle))
-    if float(faces.area.sum()) < (least := _LEAST_AREA * faces.height**2):
+    if float(faces.area.sum()) < (least := _MIN_AREA * faces.height**2):
         return _Line(0.0, angle, np.zeros(2), normal)
     across = faces.centers[:, :2] @ normal
     cell = np.floor((across - across.min()) / step).astype(int)
@@ -196,7 +196,7 @@ def _full_columns(faces: _Faces, t: Array) -> NDArray[np.int64]:
     column = np.floor((t - t.min()) / (2 * faces.height / _STEPS)).astype(int)
     shown = np.zeros((column.max() + 1, _LAYERS), bool)
     shown[column, layer.astype(int)] = True
-    return np.flatnonzero(shown.sum(axis=1) >= _LEAST_LAYERS)
+    return np.flatnonzero(shown.sum(axis=1) >= _MIN_LAYERS)
 
 
 def _between_ends(walls: list[Wall], faces: _Faces) -> list[Wall]:
@@ -236,7 +236,7 @@ def _stretches(faces: _Faces, line: _Line) -> list[tuple[float, float]]:
     starts, ends = full[np.append(0, cuts + 1)], full[np.append(cuts, len(full) - 1)] + 1
     found = [(t.min() + 2 * step * a, t.min() + 2 * step * b) for a, b in zip(starts, ends, strict=True)]
     found = _over_gaps(found, _GAP * faces.height)
-    return [(a, b) for a, b in found if b - a > _LEAST_LENGTH * faces.height]
+    return [(a, b) for a, b in found if b - a > _MIN_LENGTH * faces.height]
 
 
 def _over_gaps(pieces: list[tuple[float, float]], most: float) -> list[tuple[float, float]]:

@@ -25,11 +25,11 @@ from ...scene.world import Z_UP_FROM_Y_DOWN, World
 from ...types import VOID
 
 WEB_PAGE = "map.html"
-MOST_GAUSSIANS = 1_500_000
+MAX_GAUSSIANS = 1_500_000
 """About 20 MB of page, what can be sent by mail; of larger maps the least visible are left out."""
-_LEAST_BYTES = 10
+_MIN_BYTES = 10
 """A Gaussian's in the page; 12 in the rooms measured."""
-MOST_CAMERAS = 120
+MAX_CAMERAS = 120
 _PARTS = Path(__file__).parent / "page"
 _SCRIPTS = ("cloud.js", "draw.js", "moves.js", "tape.js", "page.js")
 
@@ -37,7 +37,7 @@ _SCRIPTS = ("cloud.js", "draw.js", "moves.js", "tape.js", "page.js")
 def write_web_page(outcome: Outcome, world: World, folder: Path) -> list[Path]:
     """map.html; nothing where there are no Gaussians. `outcome` is in `world`. Raises DiskFullError before it is made
     where there is no room for it."""
-    require_room(folder / WEB_PAGE, _LEAST_BYTES * min(len(outcome.require_map()), MOST_GAUSSIANS))
+    require_room(folder / WEB_PAGE, _MIN_BYTES * min(len(outcome.require_map()), MAX_GAUSSIANS))
     cloud = map_cloud(outcome)
     if len(cloud) == 0:
         return []
@@ -55,9 +55,9 @@ def pack_cloud(cloud: GaussianCloud, upright: NDArray[np.float64]) -> tuple[dict
     opacity, colour and class take 8 bits each. The same cloud gives the same bytes.
     """
     total, opacity = len(cloud), 1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))
-    if total > MOST_GAUSSIANS:
+    if total > MAX_GAUSSIANS:
         visible = opacity * np.exp(2 * cloud.log_scales[:, 0].astype(np.float64))
-        cloud = cloud.only(np.sort(np.argsort(-visible, kind="stable")[:MOST_GAUSSIANS]))
+        cloud = cloud.only(np.sort(np.argsort(-visible, kind="stable")[:MAX_GAUSSIANS]))
     means = cloud.means.astype(np.float64) @ upright.T
     order = morton_order(means)
     cloud, means = cloud.only(order), means[order]
@@ -112,7 +112,7 @@ def _cameras(outcome: Outcome, upright: NDArray[np.float64]) -> dict[str, Any]:
                 "r": np.round(t.cam_from_world[row][:3, :3] @ upright.T, 7).ravel().tolist(),
                 "t": round(float(t.timestamps[row]), 3),
             }
-            for row in spread_sample(rows, MOST_CAMERAS)
+            for row in spread_sample(rows, MAX_CAMERAS)
         ],
         "slope": [k.width / k.fx, k.height / k.fy],
         "shift": [(k.cx - k.width / 2) / k.fx, (k.cy - k.height / 2) / k.fy],

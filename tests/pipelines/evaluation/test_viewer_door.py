@@ -9,7 +9,7 @@ import pytest
 
 from msgs_slam.formats.gaussians import isotropic_cloud
 from msgs_slam.formats.ply import write_gaussian_ply
-from msgs_slam.pipelines.viewer.door import is_same_origin
+from msgs_slam.pipelines.viewer.request_guard import is_same_origin
 
 pytest.importorskip("viser")
 

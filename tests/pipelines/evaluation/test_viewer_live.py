@@ -20,7 +20,7 @@ from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import ProgressFile, locked
 from msgs_slam.pipelines.system.progress import BEGUN, SilentProgress, StageEvent
 from msgs_slam.pipelines.viewer import live
-from msgs_slam.pipelines.viewer.live import standing
+from msgs_slam.pipelines.viewer.live import progress_summary
 from msgs_slam.pipelines.viewer.scene import ViewerScene, load_scenes
 from tests.browser import BROWSER, browser
 
@@ -68,18 +68,20 @@ def test_each_stage_brings_its_share(run: RunFolder, tmp_path: Path) -> None:
 
 def test_a_line_says_what_is_shown_and_what_is_to_come(run: RunFolder) -> None:
     note_finished(run, STAGES[:2])
-    line = standing(run)
+    line = progress_summary(run)
     assert line.startswith(
         "Shown: cameras and points after frames (2 of 6 stages done). Still to come: tracking, mapping"
     )
     assert line.endswith(f"No job is running: `msgs-slam resume {run.root.name}` goes on.")
     with locked(run), ProgressFile(SilentProgress(), run) as progress:
         progress.stage(StageEvent("tracking", 3, 6, BEGUN))
-        assert standing(run).endswith("Still to come: tracking (running), mapping, global_ba, export.")
+        assert progress_summary(run).endswith("Still to come: tracking (running), mapping, global_ba, export.")
     note_finished(run, STAGES[:4])
-    assert "Shown: the map after mapping (4 of 6 stages done). Still to come: global_ba, export." in standing(run)
+    assert "Shown: the map after mapping (4 of 6 stages done). Still to come: global_ba, export." in progress_summary(
+        run
+    )
     note_finished(run, STAGES)
-    assert standing(run) == ""
+    assert progress_summary(run) == ""
 
 
 def test_an_error_of_the_page_does_not_end_the_watch(
@@ -94,7 +96,7 @@ def test_an_error_of_the_page_does_not_end_the_watch(
             raise IndexError("swapped meanwhile")
         followed.set()
 
-    watch = live.Watch(run, said.append, show)
+    watch = live.RunWatcher(run, said.append, show)
     note_finished(run, STAGES[:2])
     assert followed.wait(60)
     watch.stop()

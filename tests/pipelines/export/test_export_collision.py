@@ -10,7 +10,7 @@ from finished import note_finished
 from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.export.extra.meshes import MOST_FACES, with_floor
+from msgs_slam.pipelines.export.extra.meshes import MAX_FACES, with_floor
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import SAME, WORLD, World
@@ -28,13 +28,13 @@ def test_nobody_falls_through_the_floor(oracle_run: OracleRun, tmp_path: Path) -
     room.apply_translation((0, 0, 1.25))
     room.invert()
     room.visual.vertex_colors = np.full((len(room.vertices), 4), 200, np.uint8)
-    assert len(room.faces) > MOST_FACES
+    assert len(room.faces) > MAX_FACES
     room.export(run.stage("export") / "mesh.ply")
     WORLD.save(run.stage("export"), World("up", "floor", True, SAME))
     note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
     path = export_run(run, tmp_path, "collision")[0]
     light = trimesh.load(path, force="mesh")
-    assert 100 < len(light.faces) <= MOST_FACES + 100
+    assert 100 < len(light.faces) <= MAX_FACES + 100
     np.testing.assert_allclose(light.bounds, [[-3, 0, -2], [3, 2.5, 2]], atol=0.02)  # y up
     for x, z in np.random.default_rng(0).uniform((-2.9, -1.9), (2.9, 1.9), (50, 2)):
         heights = crossed(light.triangles, x, z)

@@ -34,7 +34,7 @@ Promise.all(process.argv.slice(1).map((f) => validator.validateBytes(new Uint8Ar
 @pytest.fixture
 def written(oracle_run: OracleRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[RunFolder, Path, Any]:
     """A run, its tiles and what tileset.json says of them."""
-    monkeypatch.setattr(tiles, "MOST", 3000)
+    monkeypatch.setattr(tiles, "MAX_GAUSSIANS", 3000)
     run = oracle_run()
     export_run(run, tmp_path, "tiles")
     return run, tmp_path / "tiles", json.loads((tmp_path / "tiles" / "tileset.json").read_text())

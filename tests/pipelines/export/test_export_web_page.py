@@ -90,7 +90,7 @@ def test_names_cannot_become_a_part_of_the_page(oracle_run: OracleRun, tmp_path:
 
 
 def test_a_large_map_keeps_what_is_seen_most(page: tuple[Path, Outcome], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(web_page, "MOST_GAUSSIANS", 500)
+    monkeypatch.setattr(web_page, "MAX_GAUSSIANS", 500)
     cloud = map_cloud(page[1])
     about, packed = web_page.pack_cloud(cloud, np.eye(3))
     assert (about["count"], about["total"]) == (500, len(cloud))

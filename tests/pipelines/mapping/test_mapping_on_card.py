@@ -179,7 +179,7 @@ def test_the_kernels_compile_for_cards(tmp_path: Path) -> None:
         ],
     }  # fmt: skip
     constants = {"MASKED": True, "BLOCK": 128, "TAPS": 11, "C1": 1e-4, "C2": 9e-4, "SHARE": 0.2, "STRIDE": 4}
-    constants |= {"SOLID": 0.9, "LEAST": 100, "OUTLIER": 0.02, "RIDGE": 0.003, "MOST_GAIN": 5.0, "NU": losses.NU}
+    constants |= {"SOLID": 0.9, "MIN_PIXELS": 100, "OUTLIER": 0.02, "RIDGE": 0.003, "MAX_GAIN": 5.0, "NU": losses.NU}
     numbers = ("stride", "size", "row", "step", "numbers", "width", "height", "pixels", "count")
     kinds = dict.fromkeys(numbers, "i32") | dict.fromkeys(("limit", "by_silhouette", "by_depth"), "fp32")
     masks = ("photo", "scene", "reliability", "in_view")

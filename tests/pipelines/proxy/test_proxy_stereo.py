@@ -9,12 +9,12 @@ from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.depth.stereo.fill import (
     SURE,
     agreed_depth,
-    borrow_depth,
     carry_depth,
     evidence_of,
     fill_unsure,
-    judge_by_company,
-    prefer_matches,
+    propagate_depth,
+    restore_supported_matches,
+    smooth_confidence,
 )
 from msgs_slam.pipelines.depth.stereo.matching import (
     CLEAR,
@@ -354,7 +354,7 @@ def test_filled_depths_stay_near_the_sure_ones_in_pictures_of_any_shape(shape: t
         assert 0.5 * 2 < filled.min() <= filled.max() < 2 * 3
     else:
         assert filled[~sure].max(initial=0) == 0
-    judged = judge_by_company(confidence, image)
+    judged = smooth_confidence(confidence, image)
     assert 0 <= judged.min() <= judged.max() <= 1
 
 
@@ -375,10 +375,10 @@ def test_a_chance_match_in_a_blank_wall_is_not_sure_for_it_stands_alone() -> Non
     image[:, 30:] = np.random.default_rng(3).integers(0, 40, (HEIGHT, 30, 3))
     confidence = np.where(np.arange(WIDTH)[None] < 30, 0.02, 0.8).repeat(HEIGHT, 0).astype(np.float32)
     confidence[20, 10] = 0.8
-    judged = judge_by_company(confidence, image)
+    judged = smooth_confidence(confidence, image)
     assert judged[20, 10] < SURE / 2
     assert judged[:, 36:].min() > 0.6
-    one_surface = judge_by_company(np.full((HEIGHT, WIDTH), 0.8, np.float32), image)
+    one_surface = smooth_confidence(np.full((HEIGHT, WIDTH), 0.8, np.float32), image)
     np.testing.assert_allclose(one_surface, 0.64**0.9, rtol=1e-4)
 
 
@@ -413,10 +413,10 @@ def test_a_match_that_other_views_bear_out_is_preferred_to_a_plane_in_front_of_i
 
     in_front, inner = (0.6 * truth).astype(np.float32), (slice(8, -8), slice(10, -10))
     clear, blank = np.full(truth.shape, 1e-3, np.float32), np.full(truth.shape, 1e-5, np.float32)
-    np.testing.assert_array_equal(prefer_matches(in_front, truth, borne_out, clear)[inner], truth[inner])
-    np.testing.assert_array_equal(prefer_matches(truth, in_front, borne_out, clear)[inner], truth[inner])
-    np.testing.assert_array_equal(prefer_matches(in_front, truth, borne_out, blank), in_front)
-    np.testing.assert_array_equal(prefer_matches(in_front, np.zeros_like(truth), borne_out, clear), in_front)
+    np.testing.assert_array_equal(restore_supported_matches(in_front, truth, borne_out, clear)[inner], truth[inner])
+    np.testing.assert_array_equal(restore_supported_matches(truth, in_front, borne_out, clear)[inner], truth[inner])
+    np.testing.assert_array_equal(restore_supported_matches(in_front, truth, borne_out, blank), in_front)
+    np.testing.assert_array_equal(restore_supported_matches(in_front, np.zeros_like(truth), borne_out, clear), in_front)
 
 
 def lend(truth: NDArray, color: float, confidence: float = 0.9) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -434,15 +434,15 @@ def test_unsure_depths_are_taken_from_views_that_show_the_same_colour() -> None:
     everywhere = np.ones(truth.shape, np.bool_)
     inner = (slice(4, -4), slice(10, -10))
     for carried in ([lend(truth, 0.5), lend(truth, 0.0)], [lend(truth, 0.0)], [lend(truth, 4.0)] * 2):
-        depth, confidence = borrow_depth(own, unsure, *agreed_depth(carried, everywhere))
+        depth, confidence = propagate_depth(own, unsure, *agreed_depth(carried, everywhere))
         assert np.abs(depth / truth - 1)[inner].max() < 0.02
         assert confidence[inner].min() > SURE
     for carried in ([lend(truth, 12.0)] * 4, [lend(truth, 0.0, 0.2)] * 4, [lend(truth, 4.0)]):
-        depth, confidence = borrow_depth(own, unsure, *agreed_depth(carried, everywhere))
+        depth, confidence = propagate_depth(own, unsure, *agreed_depth(carried, everywhere))
         np.testing.assert_array_equal(depth, own)
         np.testing.assert_array_equal(confidence, unsure)
     sure = np.full(truth.shape, SURE, np.float32)
-    depth, _ = borrow_depth(own, sure, *agreed_depth([lend(truth, 0.0)] * 3, everywhere))
+    depth, _ = propagate_depth(own, sure, *agreed_depth([lend(truth, 0.0)] * 3, everywhere))
     assert not agreed_depth([lend(truth, 0.0)] * 3, ~everywhere)[1].any()
     np.testing.assert_array_equal(depth, own)
 
