@@ -62,7 +62,7 @@ def test_each_stage_brings_its_share(run: RunFolder, tmp_path: Path) -> None:
     assert len(tracked.cameras) == 8
     note_finished(run, STAGES[:4])
     assert load_scenes(run.root)[0].what == "Gaussians"
-    with pytest.raises(InputError, match="no run folder"):
+    with pytest.raises(InputError, match="not a run folder"):
         load_scenes(tmp_path)
 
 
