@@ -148,6 +148,21 @@ def test_fingers_on_a_phone_fold_measure_turn_and_zoom(page: tuple[Path, Outcome
         assert "±" in tab.value(text)  # neither is a tap
 
 
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed here to run the script with")
+def test_a_place_is_sure_around_where_cameras_saw_it_from_the_more_of_them_the_farther(tmp_path: Path) -> None:
+    script = (Path(web_page.__file__).parent / "page" / "cloud.js").read_text(encoding="utf-8")
+    ahead = [1, 0, 0, 0, 0, -1, 0, 1, 0]  # along y
+    cameras = [{"r": ahead, "p": [x, 0, 0]} for x in (-2, 2)]
+    places = [0, 2, 0, 1, 2, 2, 0, 1, 9, 2, 0, 1, 0, -2, 0, 1]  # seen by both, by one, by none
+    cloud, about = {"places": places, "count": 4}, {"cameras": cameras, "slope": [2.1, 2.1]}
+    with browser(tmp_path / "profile") as tab:
+        text = tab.value(f"{script}; JSON.stringify([...seenFrom({json.dumps(cloud)}, {json.dumps(about)})])")
+    cones = np.array(json.loads(text)).reshape(4, 4) / 127
+    np.testing.assert_allclose(cones[:2, :3], [[0, -1, 0], [0, -1, 0]], atol=0.01)
+    np.testing.assert_allclose(np.degrees(np.arccos(cones[:2, 3])), [45 + 40, 35], atol=1)
+    assert not cones[2:].any()
+
+
 def until(happened: Callable[[], object]) -> None:
     end = time.monotonic() + 60
     while not happened():

@@ -3,7 +3,7 @@
 const VERTEX = `#version 300 es
 precision highp float; precision highp int;
 in vec2 corner; in uint index;
-uniform highp sampler2D places, colors, classes, palette;
+uniform highp sampler2D places, colors, classes, palette, cones;
 uniform mat3 turn; uniform vec3 place; uniform vec4 lens; uniform vec2 size; uniform bool byClass;
 out vec2 sigmas; out vec4 color;
 void main() {
@@ -12,6 +12,8 @@ void main() {
   vec4 ball = texelFetch(places, at, 0);
   color = texelFetch(colors, at, 0);
   if (byClass) color.rgb = texelFetch(palette, ivec2(int(texelFetch(classes, at, 0).r * 255.0 + 0.5), 0), 0).rgb;
+  vec4 cone = texelFetch(cones, at, 0);
+  if (cone.xyz != vec3(0)) color.a *= smoothstep(cone.w - 0.35, cone.w, dot(normalize(cone.xyz), normalize(place - ball.xyz)));
   vec3 seen = turn * (ball.xyz - place);
   float sigma = sqrt(lens.x * lens.y) * ball.w / seen.z;
   float reach = sqrt(clamp(2.0 * log(color.a * 255.0), 0.0, ${CUT_SIGMAS * CUT_SIGMAS}.0));
@@ -28,7 +30,7 @@ void main() {
   result = vec4(color.rgb * alpha, alpha);
 }`;
 
-function makePicture(canvas, cloud, classColors) {
+function makePicture(canvas, cloud, classColors, cones) {
   const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
   if (!gl) throw new Error("This browser has no WebGL 2, which drawing the map needs.");
   const program = gl.createProgram();
@@ -62,6 +64,7 @@ function makePicture(canvas, cloud, classColors) {
   texture(1, "colors", gl.RGBA8, wide, high, gl.RGBA, gl.UNSIGNED_BYTE, filled(cloud.colors, 4));
   texture(2, "classes", gl.R8, wide, high, gl.RED, gl.UNSIGNED_BYTE, filled(cloud.classes, 1));
   texture(3, "palette", gl.RGBA8, 256, 1, gl.RGBA, gl.UNSIGNED_BYTE, palette);
+  texture(4, "cones", gl.RGBA8_SNORM, wide, high, gl.RGBA, gl.BYTE, filled(cones, 4));
 
   const attribute = (name, data, use) => {
     const buffer = gl.createBuffer(), where = gl.getAttribLocation(program, name);

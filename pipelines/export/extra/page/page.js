@@ -15,7 +15,7 @@ async function start() {
   if (!window.DecompressionStream) throw new Error("this browser is too old to unpack it.");
   cloud = await unpackCloud(about, find("map").textContent);
   find("map").remove();
-  draw = makePicture(canvas, cloud, about.classes.map((c) => c.color));
+  draw = makePicture(canvas, cloud, about.classes.map((c) => c.color), seenFrom(cloud, about));
   find("message").textContent = "";
   find("panel").hidden = bare;
   find("panel").classList.toggle("folded", innerWidth <= 600);
