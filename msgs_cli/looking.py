@@ -119,7 +119,8 @@ class Size(click.ParamType):
 )  # fmt: skip
 @click.option(
     "--path", "camera_path", default="smooth", show_default=True, metavar="own|smooth|orbit|FILE",
-    help="The run's own camera path, the same smoothed, a circle about the scene, or a path saved in `view`.",
+    help="The run's own camera path, the same smoothed, an arc about the scene from where it was filmed, or a path "
+    "saved in `view`.",
 )  # fmt: skip
 @click.option(
     "--fps", type=click.FloatRange(0.1, 240), help="Images per second. Default: 30, or as the path's FILE says."

@@ -1,4 +1,4 @@
-"""The finished map as a video or as images, along the run's own path, the same smoothed, a circle or another."""
+"""The finished map as a video or as images, along the run's own path, the same smoothed, an orbit or another."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -36,6 +36,10 @@ Array = NDArray[np.float64]
 
 _FROM_OUTSIDE = 1.4
 """Sizes of a scene that one stands away from its middle: then it fills most of an image of 50 degrees."""
+
+_ALL_ROUND, _LEAST_ARC = np.radians(270), np.radians(20)
+"""An arc of cameras from which an orbit goes all the way: what the rest would see, others saw from beside it; and the
+arc of a camera that hardly moved sideways."""
 
 KINDS = ("color", "depth", "labels", "side-by-side")
 PATHS = ("own", "smooth", "orbit")
@@ -286,19 +290,32 @@ def smoothed(world_from_cam: Array, sigma: float) -> Array:
 
 
 def orbit(world_from_cam: Array, scene_depth: float, count: int, up: Array) -> Array:
-    """(count, 4, 4) once round the place the cameras look at, at their usual distance and height.
+    """(count, 4, 4) round the place the cameras look at, at their usual distance and height: once round where they
+    stood on all sides of it, else back and forth over the arc from which they saw it.
 
     scene_depth: the usual distance of the scene, which stands in where the cameras do not look at one place; up (3,)
     unit vector in the world.
     """
     focus, radius, height = _focus(world_from_cam, up, scene_depth)
-    start = world_from_cam[0, :3, 3] - focus
-    first = start - (start @ up) * up
-    first = first / np.linalg.norm(first) if np.linalg.norm(first) > 1e-9 else _any_across(up)
+    first = _any_across(up)
     second = np.cross(up, first)
-    angle = 2 * np.pi * np.arange(count) / count
+    away = world_from_cam[:, :3, 3] - focus
+    start, arc = _arc(np.arctan2(away @ second, away @ first))
+    share = np.arange(count) / count
+    turns = share if arc >= _ALL_ROUND else (1 - np.cos(2 * np.pi * share)) / 2
+    angle = start + (2 * np.pi if arc >= _ALL_ROUND else arc) * turns
     centers = focus + radius * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second) + height * up
     return _looking_at(centers, focus, up)
+
+
+def _arc(angles: Array) -> tuple[float, float]:
+    """Where the shortest arc around all of these angles begins, and its length, which is `_LEAST_ARC` at least."""
+    angles = np.sort(np.mod(angles, 2 * np.pi))
+    gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
+    widest = int(gaps.argmax())
+    arc = float(2 * np.pi - gaps[widest])
+    beyond = max(_LEAST_ARC - arc, 0) / 2
+    return float(angles[(widest + 1) % len(angles)]) - beyond, arc + 2 * beyond
 
 
 def around(middle: Array, size: float, up: Array, count: int) -> Array:

@@ -46,7 +46,8 @@ def test_smoothing_takes_tremble_out_and_leaves_the_walk(room_walk: NDArray) -> 
     assert 0 < inner.max() < 0.1
 
 
-def test_an_orbit_goes_round_what_the_cameras_look_at(room_walk: NDArray) -> None:
+def test_an_orbit_goes_round_what_the_cameras_look_at() -> None:
+    room_walk = walk(make_world(texel=0.2), np.linspace(0, 0.9, 40))
     path = orbit(room_walk, 2.5, 36, cameras_up(room_walk))
     require_rigid(path)
     centers = path[:, :3, 3]
@@ -61,10 +62,37 @@ def test_an_orbit_goes_round_what_the_cameras_look_at(room_walk: NDArray) -> Non
     assert (path[:, 2, 1] < 0).all()  # the camera's y axis points down
 
 
+def ring(degrees: NDArray) -> NDArray:
+    """Cameras around the origin, 2 away and looking at it; z is up."""
+    poses = np.tile(np.eye(4), (len(degrees), 1, 1))
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    zero, one = np.zeros_like(c), np.ones_like(c)
+    axes = ((-s, c, zero), (zero, zero, -one), (-c, -s, zero))
+    poses[:, :3, :3] = np.stack([np.stack(axis, axis=1) for axis in axes], axis=2)
+    poses[:, :2, 3] = 2 * np.stack([c, s], axis=1)
+    return poses
+
+
+@pytest.mark.parametrize(("first", "last"), [(150, 230), (-40, 60), (0, 350)])
+def test_an_orbit_stays_where_the_cameras_looked_from(first: int, last: int) -> None:
+    path = orbit(ring(np.linspace(first, last, 30)), 2.0, 60, np.array([0.0, 0, 1]))
+    require_rigid(path)
+    np.testing.assert_allclose(np.linalg.norm(path[:, :3, 3], axis=1), 2, atol=1e-6)
+    middle = np.radians((first + last) / 2)
+    angle = np.degrees(np.angle(np.exp(1j * (np.arctan2(path[:, 1, 3], path[:, 0, 3]) - middle))))
+    step = np.abs(np.diff(np.unwrap(np.radians(angle)), append=np.radians(angle[0])))
+    if last - first == 350:
+        assert np.ptp(angle) > 350
+    else:
+        np.testing.assert_allclose([angle.min(), angle.max()], [(first - last) / 2, (last - first) / 2], atol=0.5)
+        assert step.max() < np.radians(8)  # back again, without a jump
+
+
 def test_cameras_that_look_apart_still_have_an_orbit() -> None:
     poses = np.tile(np.eye(4), (10, 1, 1))
     poses[:, 0, 3] = np.linspace(0, 1, 10)  # side by side, parallel: no common point
     path = orbit(poses, 3.0, 12, cameras_up(poses))
     require_rigid(path)
     assert np.isfinite(path).all()
-    np.testing.assert_allclose(path[:, 2, 3].mean(), 3.0, atol=0.5)
+    np.testing.assert_allclose(path[:, 2, 3], 0, atol=0.1)  # where they stood, and as they looked
+    assert (path[:, 2, 2] > 0.95).all()
