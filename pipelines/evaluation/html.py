@@ -54,7 +54,8 @@ code{background:#f3f4f6;padding:1px 5px;border-radius:4px;overflow-wrap:anywhere
 .legend span{color:var(--soft)}
 details{margin-top:10px}pre{white-space:pre-wrap;overflow-wrap:anywhere}
 @media (max-width:700px){.grid{grid-template-columns:repeat(2,1fr)}.two{grid-template-columns:1fr}
-main{padding:16px 8px 40px}section{padding:12px}th,td{padding:5px 4px;font-size:13px}}
+main{padding:16px 8px 40px}section{padding:12px}th,td{padding:5px 4px;font-size:13px;min-width:5.6em}
+td:first-child,th:first-child{min-width:7.2em}pre{white-space:pre}}
 @media print{@page{margin:14mm}
 body{background:#fff;font-size:11px;print-color-adjust:exact;-webkit-print-color-adjust:exact}
 main{max-width:none;padding:0}section{border:0;padding:6px 0;margin:8px 0}

@@ -221,7 +221,7 @@ def _time_section(outcome: Outcome) -> str:
 def _export_section(outcome: Outcome) -> str:
     if "export" not in outcome.records:
         return section("Files for other programs", "<p>Not exported yet.</p>")
-    files = [row for row in files_of_export(outcome.run) if Path(row[0]).parts[0] != IMAGES]
+    files = [row for row in files_of_export(outcome.run) if Path(row[0]).parts[0] not in (IMAGES, "masks")]
     notes = readme(outcome.run.find(WORLD) or FIRST, outcome.metres, outcome.metric)
     page = outcome.run.stage("export") / WEB_PAGE
     link = f'<p><a href="export/{WEB_PAGE}">The map in one page</a>, to look at and to send.</p>'

@@ -2,9 +2,11 @@
 
 import json
 import re
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from finished import note_finished
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.evaluation.facts import Capture, advice, found_lengths, lost_stretches
-from msgs_slam.pipelines.evaluation.html import Line, plot, ticks
+from msgs_slam.pipelines.evaluation.html import Line, page, plot, section, table, ticks
 from msgs_slam.pipelines.evaluation.report import write_report
 from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, write_evaluation
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
@@ -22,6 +24,7 @@ from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import SAME, WORLD, World
 from msgs_slam.pipelines.types import LoopEdge
+from tests.browser import BROWSER, browser
 
 OracleRun = Callable[..., RunFolder]
 VOID_TAGS = {"img", "meta", "rect", "line", "path", "circle"}
@@ -176,3 +179,23 @@ def test_plots_keep_to_their_frame_and_leave_gaps() -> None:
     assert ticks(0.0, 1.0) == pytest.approx([0, 0.2, 0.4, 0.6, 0.8, 1.0])
     assert ticks(-3.1, 12.2) == [-2, 0, 2, 4, 6, 8, 10, 12] or ticks(-3.1, 12.2) == [0, 5, 10]
     assert "NaN" not in plot("nothing", "x", "y", [Line(np.full((3, 2), np.nan), "#000", "")])
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no chromium is installed here to open the page with")
+def test_on_a_phone_words_of_tables_stay_whole_and_nothing_scrolls_sideways(tmp_path: Path) -> None:
+    long = "/home/somebody/" + "a_long_name_of_a_folder" * 4
+    rows = [("global_ba", "30.7", "823", "keyframes 36, gaussians 100022, " + long), (long, "1", "2", "3")]
+    body = section(
+        "Stages", table(("stage", "seconds", "peak MB", "figures"), rows), f"<pre>{'many words ' * 30}</pre>"
+    )
+    (tmp_path / "page.html").write_text(page("A report", body))
+    with browser(tmp_path / "profile", (390, 844)) as tab:
+        tab.be_a_phone()
+        tab.call("Page.navigate", url=(tmp_path / "page.html").as_uri())
+        end = time.monotonic() + 60
+        while tab.value("document.querySelectorAll('td').length") != 8:
+            assert time.monotonic() < end
+            time.sleep(0.2)
+        assert tab.value("document.documentElement.scrollWidth") == 390
+        head = "document.querySelector('th:nth-child(2)')"
+        assert tab.value(f"{head}.clientHeight") < 40  # seconds in one line, not a letter in each
