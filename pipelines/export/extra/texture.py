@@ -19,6 +19,7 @@ from ...system.parallel import LruSequence
 from ...system.progress import Progress
 from ...types import Frame, Intrinsics
 from .atlas import Atlas, owners, simplified, unwrapped
+from .holes import filled
 
 TEXTURE_SIDE = 4096
 """A texture has at most this many pixels a side: what viewers on the web and phones take."""
@@ -214,9 +215,9 @@ def _filled(total: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def make_textured(outcome: Outcome, mesh: MeshArrays, views: Sequence[PosedDepth], progress: Progress) -> TexturedMesh:
-    """A tenth of the mesh's vertices, and an image of its surface from the keyframes that `views` are of."""
+    """Close slits, keep a tenth of the mesh's vertices, and paint an image of it from the keyframes of the `views`."""
     shots = _shots(outcome, views)
-    light = simplified(mesh)
+    light = simplified(filled(mesh, views))
     atlas = unwrapped(light, texels_wanted(light.vertices, light.faces, shots), TEXTURE_SIDE)
     texture = paint_texture(atlas, shots, progress)
     uv = (atlas.corners / (atlas.width, atlas.height)).astype(np.float32)

@@ -9,6 +9,7 @@ from msgs_slam.formats.mesh import MeshArrays
 from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.export.extra import texture
 from msgs_slam.pipelines.export.extra.atlas import Atlas, owners, simplified, unwrapped
+from msgs_slam.pipelines.export.extra.holes import filled
 from msgs_slam.pipelines.export.extra.texture import Shot, paint_texture, texels_wanted, vertex_normals, view_weights
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.system.progress import SilentProgress
@@ -169,3 +170,49 @@ def test_threads_do_not_change_a_byte(atlas: Atlas, painted: NDArray[np.uint8]) 
 def test_the_side_is_kept(atlas: Atlas) -> None:
     small = unwrapped(atlas.mesh, 1e4, 200)
     assert 150 < max(small.width, small.height) <= 200
+
+
+def sheet(side: int = 60) -> tuple[MeshArrays, PosedDepth]:
+    """A square of triangles at depth 2 with a slit, a hole as wide as five edges and an open bay, and another square
+    far behind it; and the depth that the camera sees: between the bars, in the hole, it sees the second one."""
+    y, x = np.mgrid[:side, :side]
+    number = (y * side + x).astype(np.int32)
+    a, b, c, d = (number[r, s].ravel() for r, s in (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]))
+    near = np.stack([x / side - 0.5, y / side - 0.5, np.full((side, side), 2.0)], axis=-1).reshape(-1, 3)
+    row, column = a // side, a % side
+    slit, hole = (row == 20) & (abs(column - 30) < 15), (abs(row - 40) < 3) & (abs(column - 40) < 3)
+    whole = ~(slit | hole | ((row > 50) & (abs(column - 10) < 2)))
+    faces = np.concatenate([np.stack(f, 1)[whole] for f in ((a, c, b), (b, c, d))])
+    points = np.concatenate([near, near + np.array([0, 0, 1])]).astype(np.float32)
+    behind = np.concatenate([np.stack((a, c, b), 1), np.stack((b, c, d), 1)]) + len(near)
+    mesh = MeshArrays(
+        points, np.concatenate([faces, behind]), np.zeros((len(points), 3), np.uint8), np.zeros(len(points), np.uint8)
+    )
+    through = (abs(y - 40.5) < 3) & (abs(x - 40.5) < 3)
+    depth = np.where(through, 3.0, 2.0).astype(np.float32)
+    camera = Intrinsics(side, side, 2.0 * side, 2.0 * side, side / 2, side / 2)
+    return mesh, PosedDepth(camera, np.eye(4), depth, np.ones_like(depth))
+
+
+def area(mesh: MeshArrays, faces: NDArray[np.int32]) -> float:
+    """Of these faces, in squares of the sheet."""
+    a, b, c = np.moveaxis(mesh.vertices[faces].astype(float), 1, 0)
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 * 60**2)
+
+
+def test_slits_and_bays_are_closed_and_what_a_view_looks_through_stays_open() -> None:
+    mesh, view = sheet()
+    new = filled(mesh, [view]).faces[len(mesh.faces) :]
+    middle = mesh.vertices[new].mean(axis=1) * 60 + 30
+    assert (mesh.vertices[new][..., 2] == 2).all()
+    assert not (abs(middle[:, :2] - 40.5) < 3).all(axis=1).any()
+    assert 0.9 * (29 + 3 * 8) < area(mesh, new) < 1.1 * (29 + 3 * 8)
+
+    # What the view sees there is not part of the mesh: nothing shows that the hole is one.
+    near = np.s_[:3600]
+    alone = MeshArrays(
+        mesh.vertices[near], mesh.faces[mesh.faces.max(axis=1) < 3600], mesh.colors[near], mesh.labels[near]
+    )
+    assert area(mesh, filled(alone, [view]).faces[len(alone.faces) :]) > area(mesh, new) + 20
+    # Nobody looks there.
+    assert len(filled(mesh, []).faces) == len(mesh.faces)
