@@ -107,6 +107,18 @@ def test_options_of_benchmarks_exist() -> None:
             assert option in made or option[2:] in made, f"{name} {option}"
 
 
+def test_constants_that_a_benchmark_changes_stand_in_the_code() -> None:
+    tree = ast.parse((BENCHMARKS / "constants.py").read_text(encoding="utf-8"))
+    tables = [
+        ast.literal_eval(n.value) for n in tree.body if isinstance(n, ast.Assign) and isinstance(n.value, ast.Dict)
+    ]
+    places = [place for table in tables for place in table.values()]
+    assert len(places) > 20
+    for file, line, number in places:
+        assert line in (ROOT / "pipelines" / "depth" / "stereo" / file).read_text(encoding="utf-8"), line
+        assert number in line
+
+
 def test_commands_of_benchmarks_are_understood(tmp_path: Path) -> None:
     """Every script starts and its own parser takes what the pages give it; nothing is measured."""
     commands = re.findall(r"python (tests/benchmarks/\w+\.py)((?:\\\n|[^\n`#>|])*)", texts())

@@ -50,7 +50,7 @@ AFTER = {
     "clear variance": ("fill.py", "_CLEAR = 2e-4", "2e-4"),
     "colours of borrowing": ("fill.py", "_COLOR_SD = 3.0", "3.0"),
     "borrowed depths agree": ("fill.py", "_AGREE = 0.02", "0.02"),
-    "likeness to borrow": ("fill.py", "_LEAST = 0.5", "0.5"),
+    "likeness to borrow": ("fill.py", "_MIN_MASS = 0.5", "0.5"),
 }
 """Name → file, its line, and the number in the line that is changed."""
 WITHIN = {
