@@ -68,7 +68,7 @@ class Slam:
         if found.covered < _COVERED:
             self.lost[view.frame_id] = "the map covers too little of it"
             return
-        pose = self.poses[view.frame_id] = found.cam_from_world
+        pose = self.poses[view.frame_id] = self._beside(view, found.cam_from_world, view_of, constants)
         if not (may_map and self._is_new(view, pose, constants)):
             return
         with torch.no_grad():
@@ -83,6 +83,15 @@ class Slam:
         self._optimise(view_of, STEPS, chosen, constants)
         if len(self.fields) % PRUNE_EVERY == 0:
             prune(self.gaussians, self.unit)
+
+    def _beside(self, view: View, pose: Tensor, view_of: Callable[[int], View], constants: Constants) -> Tensor:
+        """(25) for a frame and the last two keyframes, of which only the frame moves."""
+        near = self.keyframes[-2:]
+        poses = np.stack([*(self.poses[i].numpy() for i in near), pose.numpy()])
+        fields = np.stack([self.fields[i] for i in [*near, near[-1]]])
+        ids, moves = [*near, view.frame_id], np.arange(len(near) + 1) == len(near)
+        new, _ = local_adjustment(view_of, ids, poses, fields, moves, moves, self.classes, self.unit, constants)
+        return torch.from_numpy(se3.exp(se3.log(new[-1])))  # a rotation again: (15) more than doubles what it is off
 
     def _begin(self, view: View, constants: Constants) -> None:
         """First pose = identity; the scale is that of the proxy depth."""

@@ -22,6 +22,7 @@ from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.paper import stages
 from msgs_slam.pipelines.paper.constants import PAPER, constants_of
 from msgs_slam.pipelines.paper.mapping import grow
+from msgs_slam.pipelines.paper.slam import Slam
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.run.files import CLASS_IDS, CLASSES, DEPTH_FIELDS, MAP, SPARSE, TRAJECTORY
@@ -159,6 +160,18 @@ def test_the_switch_changes_three_stages_and_what_proxies_are() -> None:
     assert with_method(Config()) == Config()
     assert with_method(CONFIG).proxy == ProxyConfig(frames="all", fuse="never", moving="keep")
     assert with_method(with_method(CONFIG)) == with_method(CONFIG)
+
+
+def test_a_pose_stays_a_rotation_however_long_the_path(whole: RunFolder) -> None:
+    """What rounding adds grows 2.4 times with each prediction of (15) unless a pose is made a rotation again."""
+    recording = stages.Recording(StageContext(whole, whole.root, CONFIG, whole.stage("tracking"), SilentProgress()))
+    view = recording.views[0]
+    slam = Slam(len(recording.class_ids), 0)
+    slam._begin(view, PAPER)
+    off = torch.eye(4, dtype=torch.float64)
+    off[:3, :3] *= 1 + 1e-4
+    kept = slam._beside(view, off, recording.views.__getitem__, PAPER)[:3, :3]
+    assert float((kept @ kept.T - torch.eye(3)).abs().max()) < 1e-12
 
 
 def test_kappa_is_a_setting_and_what_depends_on_it_is_made_again() -> None:
