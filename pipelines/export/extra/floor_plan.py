@@ -18,7 +18,7 @@ from .walls import Wall, find_walls
 Array = NDArray[np.float64]
 
 FLOOR_PLAN = "floorplan.svg"
-_WIDTH, _MARGIN, _FOOT = 900, 60, 70
+_WIDTH, _MARGIN, _FOOT = 900, 60, 86
 _SIGNS = "≥: an end of this wall was not seen. ≈: it meets the next one at a flat angle, so its length is uncertain."
 _STYLE = (
     "text{font:14px system-ui,sans-serif;fill:#111;text-anchor:middle}.n{text-anchor:start;fill:#555;font-size:12px}"
@@ -53,17 +53,20 @@ def write_floor_plan(outcome: Outcome, folder: Path) -> list[Path]:
     walls, world = walls_of_run(outcome.run), outcome.run.find(WORLD)
     assert world is not None
     moved = outcome.moved(world.exported_from_run).trajectory
-    per_unit, about = 1.0, ""
-    if world.earth is None and not outcome.metric and outcome.metres is not None:
-        per_unit, about = outcome.metres.per_unit, outcome.metres.text
+    per_unit, spread, about = 1.0, 0.0, ""
+    if world.earth is None and not outcome.metric and (metres := outcome.metres) is not None:
+        per_unit, spread, about = metres.per_unit, metres.relative_sd, metres.text
     unit = "m" if about or outcome.metric or world.earth is not None else "units"
-    text = floor_plan(walls, moved.centers[moved.is_placed], outcome.run.root.stem, per_unit, unit, about)
+    text = floor_plan(walls, moved.centers[moved.is_placed], outcome.run.root.stem, per_unit, unit, about, spread)
     write_text(folder / FLOOR_PLAN, text)
     return [folder / FLOOR_PLAN]
 
 
-def floor_plan(walls: list[Wall], path: Array, title: str, per_unit: float, unit: str, about: str) -> str:
-    """An SVG of the walls and of the camera's path (N, 3); lengths are multiplied by `per_unit` and called `unit`."""
+def floor_plan(
+    walls: list[Wall], path: Array, title: str, per_unit: float, unit: str, about: str, spread: float = 0.0
+) -> str:
+    """An SVG of the walls and of the camera's path (N, 3); lengths are multiplied by `per_unit`, which has a relative
+    deviation of `spread`, and called `unit`."""
     points = np.concatenate([*(wall.ends for wall in walls), path[:, :2]])
     low, high = points.min(axis=0), points.max(axis=0)
     scale = (_WIDTH - 2 * _MARGIN) / float((high - low).max())
@@ -73,13 +76,13 @@ def floor_plan(walls: list[Wall], path: Array, title: str, per_unit: float, unit
         return np.asarray((at - low) * scale * (1, -1) + (_MARGIN, height - _MARGIN))
 
     way = " ".join(f"{x:.1f},{y:.1f}" for x, y in place(path[:, :2]))
-    notes = enumerate([_SIGNS, f"{about[0].upper()}{about[1:]}." if about else ""])
+    notes = enumerate([_SIGNS, f"{about[0].upper()}{about[1:]}." if about else "", _what_is_open(walls)])
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {max(width, 420):.0f} {height + _FOOT:.0f}">',
         f"<title>{escape(title)}: floor plan</title><style>{_STYLE}</style>",
         '<rect width="100%" height="100%" fill="#fff"/>',
         f'<polyline class="p" points="{way}"/>',
-        *(_drawn(wall, place(wall.ends), per_unit, unit) for wall in walls),
+        *(_drawn(wall, place(wall.ends), per_unit, unit, spread) for wall in walls),
         _scale_bar(scale / per_unit, unit, height),
         *(f'<text class="n" x="{_MARGIN}" y="{height + 36 + 16 * k:.0f}">{escape(n)}</text>' for k, n in notes),
         "</svg>",
@@ -87,8 +90,17 @@ def floor_plan(walls: list[Wall], path: Array, title: str, per_unit: float, unit
     return "\n".join(parts) + "\n"
 
 
-def _drawn(wall: Wall, ends: Array, per_unit: float, unit: str) -> str:
-    """A line, a stroke across each end that is no corner, and the length outside of the room."""
+def _what_is_open(walls: list[Wall]) -> str:
+    """What to film where the walls do not close a room; nothing where they do."""
+    loose = sum(not corner for wall in walls for corner in wall.corners)
+    if not loose:
+        return ""
+    seen = "1 wall was found" if len(walls) == 1 else f"{len(walls)} walls were found"
+    return f"{seen}; {loose} of their ends meet no other wall. Film the corners and the walls from floor to ceiling."
+
+
+def _drawn(wall: Wall, ends: Array, per_unit: float, unit: str, spread: float) -> str:
+    """A line, a stroke across each end that is no corner, and outside the room the length, rounded to its deviation."""
     (x1, y1), (x2, y2) = ends
     outside = np.array([-wall.normal[0], wall.normal[1]])
     parts = [f'<line class="w" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"/>']
@@ -99,7 +111,9 @@ def _drawn(wall: Wall, ends: Array, per_unit: float, unit: str) -> str:
     turn = float(np.degrees(np.arctan2(y2 - y1, x2 - x1)))
     turn = turn - 180 if turn > 90 else turn + 180 if turn < -90 else turn
     x, y = ends.mean(axis=0) + 16 * outside
-    told = f"{wall.sign}{wall.length * per_unit:.2f} {unit}"
+    length = wall.length * per_unit
+    digits = int(np.clip(np.ceil(-np.log10(max(spread * length, 0.01))), 0, 2))
+    told = f"{wall.sign}{length:.{digits}f} {unit}"
     parts.append(f'<text transform="translate({x:.1f} {y:.1f}) rotate({turn:.1f})" dy="5">{told}</text>')
     return "".join(parts)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.export.extra.floor_plan import floor_plan
 from msgs_slam.pipelines.export.extra.walls import Wall, find_walls
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -88,6 +89,21 @@ def test_a_wall_that_ends_unseen_says_so_and_nothing_upright_is_none() -> None:
     flat = trimesh.creation.box((4, 4, 0.01))
     assert find_walls(flat.vertices, flat.faces[:0]) == []
     assert Wall(np.array([[0.0, 0], [0, 2]])).normal.tolist() == [-1, 0]
+
+
+def test_a_plan_says_what_is_open_and_no_digits_that_nobody_knows() -> None:
+    open_walls = [
+        Wall(np.array([[0.0, 0], [6.34, 0]]), (False, True)),
+        Wall(np.array([[6.34, 0], [6.34, 3]]), (True, False)),
+    ]
+    closed = [Wall(np.array([a, b]), (True, True)) for a, b in zip(ROOM, np.roll(ROOM, -1, axis=0), strict=True)]
+    path = np.zeros((2, 3))
+    exact = floor_plan(open_walls, path, "room", 1.0, "m", "")
+    assert "2 walls were found; 2 of their ends meet no other wall. Film the corners" in exact
+    assert "6.34 m" in exact
+    for spread, told in ((0.25, "6 m"), (0.1, "6.3 m"), (0.002, "6.34 m")):
+        assert f"≥ {told}<" in floor_plan(open_walls, path, "room", 1.0, "m", "", spread)
+    assert "Film" not in floor_plan(closed, path, "room", 1.0, "m", "")
 
 
 def test_the_plan_of_a_run(oracle_run: OracleRun, tmp_path: Path) -> None:
