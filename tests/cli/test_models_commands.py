@@ -8,7 +8,7 @@ from click.testing import CliRunner, Result
 from onnx import TensorProto, helper
 
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.pipelines.networks import registry
+from msgs_slam.pipelines.networks import download
 from msgs_slam.pipelines.networks.registry import ModelStore
 
 
@@ -74,7 +74,7 @@ def test_what_the_program_recommends_can_be_pulled(
         fetched.append(target.stem)
         return sha256
 
-    monkeypatch.setattr(registry, "fetch", deliver)
+    monkeypatch.setattr(download, "fetch", deliver)
     done = models("pull", "--yes", *words)
     assert done.exit_code == 0, done.output
     assert {"ade20k-small", "fast-depth", "person"} <= set(fetched)
