@@ -68,8 +68,9 @@ class Slam:
         if found.covered < _COVERED:
             self.lost[view.frame_id] = "the map covers too little of it"
             return
-        pose = self.poses[view.frame_id] = self._beside(view, found.cam_from_world, view_of, constants)
+        pose = self.poses[view.frame_id] = _rotated(found.cam_from_world)
         if not (may_map and self._is_new(view, pose, constants)):
+            self.poses[view.frame_id] = self._beside(view, pose, view_of, constants)
             return
         with torch.no_grad():
             shown = show(vars(self.gaussians.map.only(self.gaussians.in_view(pose, view.intrinsics))), pose, view)
@@ -85,13 +86,14 @@ class Slam:
             prune(self.gaussians, self.unit)
 
     def _beside(self, view: View, pose: Tensor, view_of: Callable[[int], View], constants: Constants) -> Tensor:
-        """(25) for a frame and the last two keyframes, of which only the frame moves."""
+        """(25) for a frame that is no keyframe and the last two that are, of which only the frame moves: a keyframe is
+        adjusted in its window, and two others alone can lead it astray where they show little."""
         near = self.keyframes[-2:]
         poses = np.stack([*(self.poses[i].numpy() for i in near), pose.numpy()])
         fields = np.stack([self.fields[i] for i in [*near, near[-1]]])
         ids, moves = [*near, view.frame_id], np.arange(len(near) + 1) == len(near)
         new, _ = local_adjustment(view_of, ids, poses, fields, moves, moves, self.classes, self.unit, constants)
-        return torch.from_numpy(se3.exp(se3.log(new[-1])))  # a rotation again: (15) more than doubles what it is off
+        return _rotated(torch.from_numpy(new[-1]))
 
     def _begin(self, view: View, constants: Constants) -> None:
         """First pose = identity; the scale is that of the proxy depth."""
@@ -190,6 +192,11 @@ class Slam:
         looks = zip(tensors["labels"].numpy(), tensors["trust"].tolist(), strict=True)
         self.looks = dict(zip(keyframes, looks, strict=True))
         self.lost = dict.fromkeys(tensors["lost"].tolist(), "the map covers too little of it")
+
+
+def _rotated(pose: Tensor) -> Tensor:
+    """The pose with a rotation again: by (15) each frame more than doubles what it is off."""
+    return torch.from_numpy(se3.exp(se3.log(pose.numpy())))
 
 
 def _looks(view: View) -> tuple[NDArray[np.uint8], float]:
