@@ -217,7 +217,7 @@ def _yaml_numbers(text: str, path: Path, key: str, count: int) -> list[float]:
     return values
 
 
-def recognises(path: Path) -> bool:
+def recognises_replica(path: Path) -> bool:
     """Recognise results/frame*.jpg with traj.txt (NICE-SLAM), or rgb/ with semantic_class/ (Semantic-NeRF, vMAP)."""
     return _is_nice_slam(path) or any(_is_rendered(p) for p in _candidates(path))
 

@@ -9,7 +9,6 @@ from ..errors import InputError
 from ..images import IMAGE_SUFFIXES, RAW_SUFFIXES
 from ..reading import reaching
 from . import benchmarks, colmap, folder, nerfstudio, scannet
-from . import benchmarks as replica
 from .sequence import Sequence
 
 
@@ -22,7 +21,7 @@ class _Reader:
 # In the order of trying: a plain folder of images comes last, because most data sets are also that.
 _READERS = {
     "7scenes": _Reader(benchmarks.recognises_seven_scenes, benchmarks.open_seven_scenes),
-    "replica": _Reader(replica.recognises, replica.open_replica),
+    "replica": _Reader(benchmarks.recognises_replica, benchmarks.open_replica),
     "tum": _Reader(benchmarks.recognises_tum, benchmarks.open_tum_rgbd),
     "euroc": _Reader(benchmarks.recognises_euroc, benchmarks.open_euroc),
     "scannet": _Reader(scannet.recognises, scannet.open_scannet),

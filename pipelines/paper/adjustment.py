@@ -42,6 +42,16 @@ def local_adjustment(
     return _adjusted(views, ids, poses, fields, moves, bends, classes, unit, LOCAL_STEPS, constants)
 
 
+def beside(
+    views: Callable[[int], View], ids: Sequence[int], poses: Array, fields: Array, classes: int, unit: float,
+    constants: Constants = PAPER,
+) -> Array:  # fmt: skip
+    """Return the pose (4, 4) of the last of the frames `ids`, which is no keyframe, after a local adjustment beside the
+    keyframes before it, which stay."""
+    moves = np.arange(len(ids)) == len(ids) - 1
+    return local_adjustment(views, ids, poses, fields, moves, moves, classes, unit, constants)[0][-1]
+
+
 def global_adjustment(
     views: Callable[[int], View], ids: Sequence[int], poses: Array, fields: Array, classes: int, unit: float,
     constants: Constants = PAPER,

@@ -18,7 +18,7 @@ from ..mapping.move_map import follow_keyframes
 from ..mapping.views import View
 from ..render.api import Rendering
 from ..types import Intrinsics
-from .adjustment import carry, local_adjustment
+from .adjustment import beside, carry, local_adjustment
 from .constants import PAPER, Constants
 from .gaussians import Gaussians, scaled_depth, show
 from .keyframes import overlap, select, semantic_keyframes, time_weights
@@ -91,9 +91,8 @@ class Slam:
         near = self.keyframes[-2:]
         poses = np.stack([*(self.poses[i].numpy() for i in near), pose.numpy()])
         fields = np.stack([self.fields[i] for i in [*near, near[-1]]])
-        ids, moves = [*near, view.frame_id], np.arange(len(near) + 1) == len(near)
-        new, _ = local_adjustment(view_of, ids, poses, fields, moves, moves, self.classes, self.unit, constants)
-        return _rotated(torch.from_numpy(new[-1]))
+        new = beside(view_of, [*near, view.frame_id], poses, fields, self.classes, self.unit, constants)
+        return _rotated(torch.from_numpy(new))
 
     def _begin(self, view: View, constants: Constants) -> None:
         """First pose = identity; the scale is that of the proxy depth."""

@@ -36,7 +36,7 @@ from ..run.files import (
 from ..system.progress import is_asked
 from ..system.wording import stretches
 from ..types import LoopEdge, Trajectory
-from .adjustment import carry, global_adjustment, local_adjustment, pose_graph
+from .adjustment import beside, carry, global_adjustment, pose_graph
 from .constants import constants_of
 from .gaussians import Gaussians
 from .loops import candidates, close, small_looks
@@ -274,20 +274,14 @@ def _adjusted(
 def _between(context: StageContext, recording: Recording, trajectory: Trajectory, fields: DepthFields) -> Trajectory:
     """(25) for each frame that is no keyframe and its two neighbours that are, of which only the frame moves."""
     keys, poses = trajectory.frame_ids[trajectory.is_keyframe], trajectory.cam_from_world.copy()
-    unit, row = (
-        scene_depth(recording, keys.tolist(), fields),
-        {i: n for n, i in enumerate(trajectory.frame_ids.tolist())},
-    )
+    unit = scene_depth(recording, keys.tolist(), fields)
+    row = {i: n for n, i in enumerate(trajectory.frame_ids.tolist())}
+    views, classes, constants = recording.views.__getitem__, len(recording.class_ids), constants_of(context.config)
     left = trajectory.frame_ids[trajectory.is_posed & ~trajectory.is_keyframe].tolist()
     for i in context.progress.track(left, "adjusting", len(left)):
         after = int(np.clip(np.searchsorted(keys, i), 1, len(keys) - 1))
         ids = [*keys[max(after - 1, 0) : after + 1].tolist(), i]
         own = np.stack([fields.of_frame[k] for k in [*ids[:-1], ids[0]]])
         where = np.stack([poses[row[k]] for k in ids])
-        moves = np.arange(len(ids)) == len(ids) - 1
-        found, _ = local_adjustment(
-            recording.views.__getitem__, ids, where, own, moves, moves, len(recording.class_ids), unit,
-            constants_of(context.config),
-        )  # fmt: skip
-        poses[row[i]] = found[-1]
+        poses[row[i]] = beside(views, ids, where, own, classes, unit, constants)
     return replace(trajectory, cam_from_world=poses)

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ....formats.mesh import MeshArrays
-from ...geometry.camera import project
 from ...geometry.posed_depth import PosedDepth
 from ...system.jit import kernel
 
@@ -35,7 +34,7 @@ def filled(mesh: MeshArrays, views: Iterable[PosedDepth]) -> MeshArrays:
     edge = float(np.median(np.linalg.norm(points[mesh.faces[:, 0]] - points[mesh.faces[:, 1]], axis=1)))
     order = np.argsort(rims[:, 0], kind="stable")
     after = _chained(points, rims, order, np.searchsorted(rims[order, 0], rims[:, 1]))
-    normals = _normals(points, mesh.faces)
+    normals = normal_sums(points, mesh.faces)
     new = _clipped(points, normals, rims, after, edge, _SPAN * edge)
     normal = np.cross(points[new[:, 1]] - points[new[:, 0]], points[new[:, 2]] - points[new[:, 0]])
     around = normals[new].sum(1)
@@ -52,8 +51,8 @@ def _rims(faces: NDArray[np.int32]) -> NDArray[np.int64]:
     return edges[~np.isin(edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0])]
 
 
-def _normals(points: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
-    """(V, 3) sums of the normals of the faces around, each twice as long as the face is large."""
+def normal_sums(points: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Return (V, 3) sums of the normals of the faces around, each twice as long as the face is large."""
     corners, total = points[faces], np.zeros_like(points)
     of_face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     for k in range(3):
@@ -116,14 +115,12 @@ def _is_seen(
     """(T,) where at least one view looks at a place, and no more look past it at vertices of the mesh."""
     supports, opposes, surface = *np.zeros((2, len(middles)), np.int64), cKDTree(points)
     for view in views:
-        pose, k = view.cam_from_world, view.intrinsics
-        xy, z = project(middles @ pose[:3, :3].T + pose[:3, 3], k)
-        inside = np.flatnonzero((z > 0) & ((xy >= 0) & (xy < (k.width, k.height))).all(1))
+        xy, z, is_inside = view.seen(middles)
+        inside = np.flatnonzero(is_inside)
         column, row = xy[inside].astype(int).T
         beyond, trusted = view.depth[row, column] - z[inside], view.trust[row, column] > 0
         past = np.flatnonzero(trusted & (beyond > _NEAR * edge))
-        eye = np.linalg.inv(pose)[:3, 3]
-        shown = eye + (middles[inside[past]] - eye) * (1 + beyond[past] / z[inside[past]])[:, None]
+        shown = view.in_world(xy[inside[past]], z[inside[past]] + beyond[past])
         is_mesh = surface.query(shown, distance_upper_bound=_MET * edge)[0] < np.inf
         supports[inside] += ~trusted | (beyond >= -_NEAR * edge)
         supports[inside[past[is_mesh]]] -= 1

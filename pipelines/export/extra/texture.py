@@ -19,7 +19,7 @@ from ...system.parallel import LruSequence
 from ...system.progress import Progress
 from ...types import Frame, Intrinsics
 from .atlas import Atlas, owners, simplified, unwrapped
-from .holes import filled
+from .holes import filled, normal_sums
 
 TEXTURE_SIDE = 4096
 """A texture has at most this many pixels a side: what viewers on the web and phones take."""
@@ -70,11 +70,7 @@ def paint_texture(atlas: Atlas, shots: Sequence[Shot], progress: Progress) -> ND
 
 def vertex_normals(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> NDArray[np.float64]:
     """(V, 3) unit normals, faces weighted by their area; 0 for a vertex without faces."""
-    corners = vertices[faces].astype(np.float64)
-    of_face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros((len(vertices), 3))
-    for k in range(3):
-        np.add.at(total, faces[:, k], of_face)
+    total = normal_sums(vertices.astype(np.float64), faces)
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
 
 
