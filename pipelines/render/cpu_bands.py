@@ -29,20 +29,20 @@ CHECK_EVERY = 32
 _ALPHA_MIN, _CUT2 = F32(reference.ALPHA_MIN), F32(reference.CUT_SIGMAS**2)
 _ALPHA_MAX, _MIN_TRANSMITTANCE = F32(reference.ALPHA_MAX), F32(reference.TRANSMITTANCE_MIN)
 _HALF, _ZERO, _ONE, _TWO = F32(0.5), F32(0), F32(1), F32(2)
+_WIDE, _CUT = F32(1.001 * reference.ALPHA_MIN * math.exp(reference.CUT_SIGMAS**2 / 2)), F32(reference.CUT_SIGMAS)
+"""Gaussians more opaque than the first reach as far as any: to so many deviations."""
 
 
 @inner
 def first_pixel(low: np.float32) -> int:
-    """The first pixel whose centre is >= low, if low > -1/2; else 0."""
-    return math.ceil(low - _HALF) if low > _HALF else 0
+    """The first pixel whose centre is >= low; at least 0."""
+    return np.int32(math.ceil(max(low - _HALF, _ZERO)))
 
 
 @inner
 def last_pixel(high: np.float32, size: int) -> int:
     """The last pixel below `size` whose centre is <= high; -1 if there is none."""
-    if high >= F32(size):
-        return size - 1
-    return math.floor(high - _HALF) if high >= _HALF else -1
+    return np.int32(math.floor(max(min(high - _HALF, F32(size - 1)), -_ONE)))
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def bin_gaussians(
     """Find how far from its centre each Gaussian is seen, in pixels (M,), 0 where it is not seen at all; and the first
     four fields of `Bands`, entries in the order of their indices."""
     count, bands, parts = len(projected[0]), -(-height // BAND_ROWS), -(-len(projected[0]) // PART)
-    reach, first, last = np.zeros(count, np.float32), np.zeros(count, np.int32), np.full(count, -1, np.int32)
+    reach, (first, last) = np.empty(count, np.float32), np.empty((2, count), np.int32)
     counts = np.zeros((parts, bands), np.int64)
 
     def own(part: int) -> slice:
@@ -144,19 +144,28 @@ def find_bands(
     last: NDArray[np.int32],
     counts: NDArray[np.int64],
 ) -> None:
-    """Fill in what is not 0 of `reach`, and the `first` and `last` band, of those that are seen; counts (B,): how many
-    are seen in each band."""
+    """Fill in `reach`, 0 where it is not seen, and the `first` and `last` band, 0 and -1 there; counts (B,): how many
+    are seen in each band. Nothing branches on what is seen, so that loops become vector instructions."""
     right, bottom = F32(width) - _HALF, F32(height) - _HALF
     for i in range(len(u)):
-        if z[i] > near and opacity[i] > _ALPHA_MIN:
-            r = sigma_px[i] * np.sqrt(min(_CUT2, _TWO * np.log(opacity[i] / _ALPHA_MIN)))
-            if r > 0 and u[i] + r >= _HALF and u[i] - r <= right and v[i] + r >= _HALF and v[i] - r <= bottom:
-                top, low = first_pixel(v[i] - r), last_pixel(v[i] + r, height)
-                if low >= top:  # else it lies between two rows of pixels
-                    reach[i] = r
-                    first[i], last[i] = top // BAND_ROWS, low // BAND_ROWS
-                    for band in range(first[i], last[i] + 1):
-                        counts[band] += 1
+        reach[i] = sigma_px[i] * _CUT
+        if opacity[i] <= _WIDE:
+            reach[i] = sigma_px[i] * np.sqrt(min(_CUT2, _TWO * np.log(max(opacity[i], _ALPHA_MIN) / _ALPHA_MIN)))
+    for i in range(len(u)):
+        r = reach[i]
+        top, low = first_pixel(min(v[i] - r, bottom + _ONE)), last_pixel(v[i] + r, height)
+        seen = (z[i] > near) & (opacity[i] > _ALPHA_MIN) & (r > 0) & (low >= top)  # else between two rows of pixels
+        seen &= (u[i] + r >= _HALF) & (u[i] - r <= right) & (v[i] + r >= _HALF) & (v[i] - r <= bottom)
+        reach[i] = r if seen else _ZERO
+        first[i], last[i] = top // BAND_ROWS if seen else 0, low // BAND_ROWS if seen else -1
+    steps = np.zeros(len(counts) + 1, np.int64)
+    for i in range(len(u)):
+        steps[first[i]] += 1
+        steps[last[i] + 1] -= 1
+    for band in range(len(counts)):
+        counts[band] = steps[band]
+        if band > 0:
+            counts[band] += counts[band - 1]
 
 
 @kernel
@@ -212,28 +221,55 @@ def list_tiles(
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """List who may touch tile t of a band from row `top`, near to far: members[starts[t]:starts[t + 1]]."""
     count = len(records) // RECORD
-    across = (width + TILE - 1) // TILE
-    tiles = across * ((rows + TILE - 1) // TILE)
-    boxes = np.empty(4 * count, np.int32)
-    ends = np.zeros(tiles + 2, np.int64)
+    across, down = (width + TILE - 1) // TILE, (rows + TILE - 1) // TILE
+    boxes = np.empty((4, count), np.int32)
     for k in range(count):
         x, y, r = records[k * RECORD], records[k * RECORD + 1] - F32(top), records[k * RECORD + 5]
-        x0, x1 = first_pixel(x - r) // TILE, last_pixel(x + r, width) // TILE
-        y0, y1 = first_pixel(y - r) // TILE, last_pixel(y + r, rows) // TILE
-        boxes[4 * k], boxes[4 * k + 1], boxes[4 * k + 2], boxes[4 * k + 3] = x0, x1, y0, y1
-        for y_tile in range(y0, y1 + 1):
-            for x_tile in range(x0, x1 + 1):
-                ends[y_tile * across + x_tile + 2] += 1
-    for tile in range(tiles):
-        ends[tile + 2] += ends[tile + 1]
-    members = np.empty(ends[tiles + 1], np.int32)
+        boxes[0, k], boxes[1, k] = first_pixel(x - r) // TILE, last_pixel(x + r, width) // TILE
+        boxes[2, k], boxes[3, k] = first_pixel(y - r) // TILE, last_pixel(y + r, rows) // TILE
+    starts = _tile_starts(boxes, across, down)
+    # Most touch two by two tiles or fewer: a loop of so many steps would be guessed wrongly. What is none of them goes
+    # to a place behind all.
+    nowhere, ends = starts[across * down], starts.copy()
+    members = np.empty(nowhere + 1, np.int32)
     for k in range(count):
-        for y_tile in range(boxes[4 * k + 2], boxes[4 * k + 3] + 1):
-            for x_tile in range(boxes[4 * k], boxes[4 * k + 1] + 1):
-                place = y_tile * across + x_tile + 1
-                members[ends[place]] = k
-                ends[place] += 1
-    return ends[: tiles + 1], members
+        x0, x1, y0, y1 = boxes[0, k], boxes[1, k], boxes[2, k], boxes[3, k]
+        if x1 - x0 > 1 or y1 - y0 > 1:
+            for y_tile in range(y0, y1 + 1):
+                for x_tile in range(x0, x1 + 1):
+                    members[ends[y_tile * across + x_tile]] = k
+                    ends[y_tile * across + x_tile] += 1
+        elif x1 >= x0 and y1 >= y0:
+            for tile, touched in (
+                (y0 * across + x0, True), (y0 * across + x1, x1 > x0), (y1 * across + x0, y1 > y0),
+                (y1 * across + x1, x1 > x0 and y1 > y0),
+            ):  # fmt: skip
+                members[ends[tile] if touched else nowhere] = k
+                ends[tile] += touched
+    return starts, members[:nowhere]
+
+
+@inner
+def _tile_starts(boxes: NDArray[np.int32], across: int, down: int) -> NDArray[np.int64]:
+    """Starts of the tiles' members, row by row, and the end (T + 1,): a box x0, x1, y0, y1 of tiles is counted at its
+    corners, which are then summed up along both axes."""
+    wide = across + 1
+    corners = np.zeros((down + 1) * wide, np.int64)
+    for k in range(boxes.shape[1]):
+        x0, x1, y0, y1 = boxes[0, k], boxes[1, k] + 1, wide * boxes[2, k], wide * (boxes[3, k] + 1)
+        corners[y0 + x0] += 1
+        corners[y0 + x1] -= 1
+        corners[y1 + x0] -= 1
+        corners[y1 + x1] += 1
+    starts = np.zeros(across * down + 1, np.int64)
+    for y in range(down):
+        row = 0
+        for x in range(across):
+            row += corners[wide * y + x]
+            above = corners[wide * (y - 1) + x] if y > 0 else 0
+            corners[wide * y + x] = row + above
+            starts[across * y + x + 1] = starts[across * y + x] + row + above
+    return starts
 
 
 @inner
