@@ -28,7 +28,7 @@ from .matching import (
     poses_at,
     poses_for_images,
     read_timed_files,
-    times_or_frame_numbers,
+    sequence_of,
 )
 from .sequence import Camera, LabelClass, Sequence, read_classes_json
 
@@ -54,11 +54,6 @@ _SEVEN_SCENES_NOTES = (
 )
 
 
-def recognises_seven_scenes(path: Path) -> bool:
-    """Recognise frame-000000.color.png and the like."""
-    return any(path.glob("frame-*.color.*"))
-
-
 def open_seven_scenes(path: Path) -> Sequence:
     """One seq-XX folder of 7-Scenes. Metric poses; frames whose pose file is missing or not finite have none.
 
@@ -71,18 +66,15 @@ def open_seven_scenes(path: Path) -> Sequence:
     if not images or None in numbers:
         raise InputError(f"{path} has no frame-XXXXXX.color images: give one of the scene's seq-XX folders")
     size = image_size(first_readable(images))
-    return Sequence(
-        format="7scenes",
-        root=path,
-        names=tuple(p.name for p in images),
+    return sequence_of(
+        "7scenes", path, images,
         timestamps=np.array(numbers, dtype=np.float64) / ASSUMED_RATE,
-        image_paths=tuple(images),
         camera=_seven_scenes_camera(path / "camera-intrinsics-color.txt", size, _COLOR_FOCAL),
         world_from_cam=np.stack([_seven_scenes_pose(p) for p in images]),
         depth_paths=files_for_images(images, path, "*.depth.png"),
         depth_camera=_seven_scenes_camera(path / "camera-intrinsics.txt", (640, 480), _DEPTH_FOCAL),
         notes=_SEVEN_SCENES_NOTES,
-    )
+    )  # fmt: skip
 
 
 def _seven_scenes_pose(image: Path) -> NDArray[np.float64]:
@@ -101,11 +93,6 @@ def _seven_scenes_camera(path: Path, size: tuple[int, int], focal: float) -> Cam
     return Camera(width, height, float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
 
 
-def recognises_tum(path: Path) -> bool:
-    """Recognise a folder with rgb.txt and the images it lists."""
-    return (path / "rgb.txt").is_file() and (path / "rgb").is_dir()
-
-
 def open_tum_rgbd(path: Path) -> Sequence:
     """Open a TUM RGB-D sequence: metric poses of the colour camera, depth registered to colour.
 
@@ -116,18 +103,15 @@ def open_tum_rgbd(path: Path) -> Sequence:
     times, images = read_timed_files(path / "rgb.txt", path, float, _TUM_LINE)
     camera, notes = _tum_camera(path, first_readable(images))
     truth = path / "groundtruth.txt"
-    return Sequence(
-        format="tum",
-        root=path,
-        names=tuple(p.name for p in images),
+    return sequence_of(
+        "tum", path, images,
         timestamps=times,
-        image_paths=tuple(images),
         camera=camera,
         world_from_cam=poses_at(times, *read_tum(truth)) if truth.is_file() else None,
         depth_paths=_tum_depth(path, times),
         depth_per_metre=_DEPTH_PER_METRE,
         notes=notes,
-    )
+    )  # fmt: skip
 
 
 def _tum_depth(path: Path, times: NDArray[np.float64]) -> tuple[Path | None, ...]:
@@ -152,11 +136,6 @@ def _tum_camera(path: Path, image: Path) -> tuple[Camera | None, tuple[str, ...]
     return replace(camera, is_nominal=not found), notes
 
 
-def recognises_euroc(path: Path) -> bool:
-    """Recognise a folder with mav0/cam0/data.csv, or mav0 itself."""
-    return any((root / "cam0" / "data.csv").is_file() for root in (path / "mav0", path))
-
-
 def open_euroc(path: Path) -> Sequence:
     """Open the left camera of a EuRoC sequence: metric poses, grey images with lens distortion, no depth.
 
@@ -166,15 +145,8 @@ def open_euroc(path: Path) -> Sequence:
     root = path / "mav0" if (path / "mav0" / "cam0").is_dir() else path
     times, images = _euroc_images(root / "cam0")
     camera, body_from_cam = _euroc_calibration(root / "cam0" / "sensor.yaml")
-    return Sequence(
-        format="euroc",
-        root=path,
-        names=tuple(p.name for p in images),
-        timestamps=times,
-        image_paths=tuple(images),
-        camera=camera,
-        world_from_cam=_euroc_poses(root / "state_groundtruth_estimate0" / "data.csv", times, body_from_cam),
-    )
+    poses = _euroc_poses(root / "state_groundtruth_estimate0" / "data.csv", times, body_from_cam)
+    return sequence_of("euroc", path, images, timestamps=times, camera=camera, world_from_cam=poses)
 
 
 def _euroc_images(cam: Path) -> tuple[NDArray[np.float64], list[Path]]:
@@ -252,47 +224,35 @@ def _open_nice_slam(path: Path) -> Sequence:
     images = [p for p in list_images(path / "results") if p.name.startswith("frame")]
     parameters = next((p / "cam_params.json" for p in (path, path.parent) if (p / "cam_params.json").is_file()), None)
     camera, scale = _wide_camera(first_readable(images)), 6553.5
-    times, timed = times_or_frame_numbers(images)
     if parameters is not None:
         camera, given = read_intrinsics_json(parameters, integer_centres=True)
         scale = given or scale
-    return Sequence(
-        format="replica",
-        root=path,
-        names=tuple(p.name for p in images),
-        timestamps=times,
-        image_paths=tuple(images),
-        timed=timed,
+    return sequence_of(
+        "replica", path, images,
         camera=camera,
         world_from_cam=poses_for_images(images, read_matrices(path / "traj.txt"), path / "traj.txt"),
         depth_paths=files_for_images(images, path / "results", "depth*"),
         depth_per_metre=scale,
         depth_invalid=(0,),  # at 6553.5 a metre, 65535 is a true 10 m
-    )
+    )  # fmt: skip
 
 
 def _open_rendered(path: Path) -> Sequence:
     images = list_images(path / "rgb")
     camera, scale = _wide_camera(first_readable(images)), None
-    times, timed = times_or_frame_numbers(images)
     if (path / "cam_params.json").is_file():
         camera, scale = read_intrinsics_json(path / "cam_params.json", integer_centres=True)
     label_folder = next(path / name for name in _CLASS_FOLDERS if (path / name).is_dir())
     label_paths = files_for_images(images, label_folder)
-    return Sequence(
-        format="replica",
-        root=path,
-        names=tuple(p.name for p in images),
-        timestamps=times,
-        image_paths=tuple(images),
-        timed=timed,
+    return sequence_of(
+        "replica", path, images,
         camera=camera,
         world_from_cam=_rendered_poses(path, images),
         depth_paths=files_for_images(images, path / "depth"),
         depth_per_metre=scale or 1000.0,
         label_paths=label_paths,
         classes=_classes(path, label_paths),
-    )
+    )  # fmt: skip
 
 
 def _rendered_poses(path: Path, images: list[Path]) -> NDArray[np.float64] | None:

@@ -8,7 +8,7 @@ from ..colmap import MODEL_FOLDERS, ColmapModel, model_suffix, read_colmap_model
 from ..errors import InputError
 from ..image_folder import natural_key
 from ..reading import named_file, resolve_within
-from .matching import times_or_frame_numbers
+from .matching import sequence_of
 from .sequence import Camera, Sequence
 
 _IMAGE_FOLDERS = ("images", "frames", ".", "rgb")
@@ -40,21 +40,16 @@ def open_colmap(path: Path) -> Sequence:
     found = [i for i in order if files[i] is not None]
     images = [file for i in found if (file := files[i]) is not None]
     camera, notes = _shared_camera(model)
-    times, timed = times_or_frame_numbers(images)
     if len(found) < len(order):
         notes += (f"{len(order) - len(found)} of the model's {len(order)} images are missing in {root}",)
-    return Sequence(
-        format="colmap",
-        root=path,
+    return sequence_of(
+        "colmap", path, images,
         names=tuple(model.names[i].replace("/", "_") for i in found),
-        timestamps=times,
-        image_paths=tuple(images),
-        timed=timed,
         camera=camera,
         world_from_cam=np.asarray(np.linalg.inv(model.cam_from_world[found]), dtype=np.float64),
         metric=False,
         notes=notes,
-    )
+    )  # fmt: skip
 
 
 def _find_model(path: Path) -> Path | None:

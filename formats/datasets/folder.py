@@ -10,7 +10,7 @@ from ..image_folder import count_images, list_images
 from ..textfile import read_rows
 from ..trajectory import read_matrices, read_tum
 from .calibration import read_intrinsics_json
-from .matching import classes_found, files_for_images, poses_at, poses_for_images, times_or_frame_numbers
+from .matching import classes_found, files_for_images, poses_at, poses_for_images, sequence_of, times_or_frame_numbers
 from .sequence import Camera, LabelClass, Sequence, read_classes_json
 
 _IMAGE_FOLDERS = ("rgb", "images", "color", "frames")
@@ -43,12 +43,9 @@ def open_folder(path: Path) -> Sequence:
     camera, depth_scale = _camera(root)
     depth_paths = _first(images, root, _DEPTH_FOLDERS)
     label_paths = _first(images, root, _LABEL_FOLDERS)
-    return Sequence(
-        format="folder",
-        root=root,
-        names=tuple(p.name for p in images),
+    return sequence_of(
+        "folder", root, images,
         timestamps=times,
-        image_paths=tuple(images),
         timed=timed,
         camera=camera,
         world_from_cam=_poses(images, times, root),
@@ -57,7 +54,7 @@ def open_folder(path: Path) -> Sequence:
         label_paths=label_paths,
         classes=_classes(root, label_paths),
         notes=_unused_images(counts, folder),
-    )
+    )  # fmt: skip
 
 
 def image_folder(path: Path) -> Path | None:

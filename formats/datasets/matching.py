@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from ..image_folder import frame_number, natural_key, read_image_times
 from ..images import IMAGE_SUFFIXES
 from ..reading import resolve_within
 from ..textfile import read_rows
-from .sequence import LabelClass, used_label_ids
+from .sequence import LabelClass, Sequence, used_label_ids
 
 ASSUMED_RATE = 30.0
 """Frames per second where a data set does not say."""
@@ -106,6 +107,15 @@ def nearest_index(sorted_times: NDArray[np.float64], times: NDArray[np.float64])
     before = (after - 1).clip(0)
     closer = np.abs(sorted_times[before] - times) <= np.abs(sorted_times[after] - times)
     return np.where(closer, before, after).astype(np.int64)
+
+
+def sequence_of(format: str, root: Path, images: list[Path], **fields: Any) -> Sequence:
+    """Make the sequence of image files, called as they are, at the times that they or their names state, unless the
+    other `fields` say otherwise."""
+    if "timestamps" not in fields:
+        fields["timestamps"], fields["timed"] = times_or_frame_numbers(images)
+    names = fields.pop("names", tuple(p.name for p in images))
+    return Sequence(format, root, names, image_paths=tuple(images), **fields)
 
 
 def times_or_frame_numbers(images: list[Path]) -> tuple[NDArray[np.float64], bool]:

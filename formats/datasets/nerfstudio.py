@@ -15,7 +15,7 @@ from ..images import first_readable, image_size
 from ..reading import named_file
 from ..textfile import number, optional_number, read_json_object
 from ..trajectory import OPENCV_FROM_OPENGL, clean_poses
-from .matching import times_or_frame_numbers
+from .matching import sequence_of
 from .sequence import Camera, Sequence, distortion_names
 
 _FILE_NAMES = ("transforms.json", "transforms_train.json")
@@ -60,20 +60,15 @@ def open_nerfstudio(path: Path) -> Sequence:
     depth_paths = tuple(_depth(file, frame) for frame in kept)
     camera, notes = _camera(table, kept, file, first_readable(paths))
     missing = len(frames) - len(kept)
-    times, timed = times_or_frame_numbers(paths)
-    return Sequence(
-        format="nerfstudio",
-        root=path,
+    return sequence_of(
+        "nerfstudio", path, paths,
         names=_names(file, paths),
-        timestamps=times,
-        image_paths=tuple(paths),
-        timed=timed,
         camera=camera,
         world_from_cam=clean_poses(poses, str(file)),
         metric=any(depth_paths),
         depth_paths=depth_paths if any(depth_paths) else (),
         notes=notes + ((f"{missing} of {len(frames)} frames have no image on disk",) if missing else ()),
-    )
+    )  # fmt: skip
 
 
 def _file(path: Path) -> Path | None:

@@ -20,12 +20,15 @@ class _Reader:
 
 # In the order of trying: a plain folder of images comes last, because most data sets are also that.
 _READERS = {
-    "7scenes": _Reader(benchmarks.recognises_seven_scenes, benchmarks.open_seven_scenes),
+    "7scenes": _Reader(lambda path: any(path.glob("frame-*.color.*")), benchmarks.open_seven_scenes),
     "replica": _Reader(benchmarks.recognises_replica, benchmarks.open_replica),
-    "tum": _Reader(benchmarks.recognises_tum, benchmarks.open_tum_rgbd),
-    "euroc": _Reader(benchmarks.recognises_euroc, benchmarks.open_euroc),
+    "tum": _Reader(lambda path: (path / "rgb.txt").is_file() and (path / "rgb").is_dir(), benchmarks.open_tum_rgbd),
+    "euroc": _Reader(
+        lambda path: any((root / "cam0" / "data.csv").is_file() for root in (path / "mav0", path)),
+        benchmarks.open_euroc,
+    ),
     "scannet": _Reader(scannet.recognises, scannet.open_scannet),
-    "sens": _Reader(scannet.recognises_sens, scannet.open_sens),
+    "sens": _Reader(lambda path: path.is_file() and path.suffix.lower() == ".sens", scannet.open_sens),
     "nerfstudio": _Reader(nerfstudio.recognises, nerfstudio.open_nerfstudio),
     "colmap": _Reader(colmap.recognises, colmap.open_colmap),
     "folder": _Reader(folder.recognises, folder.open_folder),

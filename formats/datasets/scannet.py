@@ -15,7 +15,7 @@ from ..images import MAX_IMAGE_PIXELS, decode_rgb, first_readable, image_size
 from ..reading import opened, require_file
 from ..textfile import read_table
 from ..trajectory import clean_poses, read_matrices
-from .matching import ASSUMED_RATE, classes_found, files_for_images, times_or_frame_numbers
+from .matching import ASSUMED_RATE, classes_found, files_for_images, sequence_of, times_or_frame_numbers
 from .sequence import Camera, LabelClass, Sequence, find_label_table, read_nyu40_classes
 
 _VERSION = 4
@@ -45,19 +45,16 @@ def open_scannet(path: Path) -> Sequence:
     label_paths = files_for_images(images, label_folder)
     depth_paths = files_for_images(images, path / "depth")
     first_depth = next((p for p in depth_paths if p is not None), None)
-    return Sequence(
-        format="scannet",
-        root=path,
-        names=tuple(p.name for p in images),
+    return sequence_of(
+        "scannet", path, images,
         timestamps=times_or_frame_numbers(images)[0],  # the frame numbers count at the sensor's 30 a second
-        image_paths=tuple(images),
         camera=_camera(path / "intrinsic" / "intrinsic_color.txt", first_readable(images), _COLOR_SIZE),
         world_from_cam=np.stack([_pose(path / "pose" / f"{p.stem}.txt") for p in images]),
         depth_paths=depth_paths,
         depth_camera=_camera(path / "intrinsic" / "intrinsic_depth.txt", first_depth, _DEPTH_SIZE),
         label_paths=label_paths,
         classes=_classes(path, label_paths),
-    )
+    )  # fmt: skip
 
 
 def _pose(path: Path) -> NDArray[np.float64]:
@@ -90,11 +87,6 @@ def _classes(path: Path, label_paths: tuple[Path | None, ...]) -> tuple[LabelCla
         return ()
     table = find_label_table(path)
     return classes_found(label_paths) if table is None else read_nyu40_classes(table)
-
-
-def recognises_sens(path: Path) -> bool:
-    """Recognise a file named .sens."""
-    return path.is_file() and path.suffix.lower() == ".sens"
 
 
 @dataclass(frozen=True)

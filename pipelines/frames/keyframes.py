@@ -16,7 +16,7 @@ from ..config import FramesConfig
 from ..engine.stages import StageContext
 from ..sfm.flow import corners, follow
 from ..source.faces import Faces
-from ..source.opening import AnySource
+from ..source.opening import Source
 from ..source.sharpness import reduce_image, sharpest_of_windows
 from ..types import Frame
 from .masks import picked
@@ -101,7 +101,7 @@ class _Tracker:
         return float(np.median(distance)) / gray.shape[1], survivors
 
 
-def pick_frames(context: StageContext, source: AnySource, faces: Faces | None) -> list[Frame]:
+def pick_frames(context: StageContext, source: Source, faces: Faces | None) -> list[Frame]:
     """The sharpest image of every window of time, kept in the snapshot. Raises InputError for a source of one."""
     table = context.snapshot / "picked.json"
     if table.exists():
@@ -141,7 +141,7 @@ def _untimed(config: FramesConfig, frame_id: int) -> float:
     return frame_id / (config.rate if config.rate > 0 else 1.0)
 
 
-def _save_picked(context: StageContext, source: AnySource, picture: VideoFrame, name: str, faces: Faces | None) -> None:
+def _save_picked(context: StageContext, source: Source, picture: VideoFrame, name: str, faces: Faces | None) -> None:
     if faces is not None:
         for face, rgb in zip(faces.names(name), faces.cut(picture.rgb), strict=True):
             write_rgb(picked(context, face), rgb)

@@ -21,7 +21,7 @@ from ..geometry.camera import ONE_CAMERA, Rig
 from ..masks.people import PeopleCards, PeopleFinder, people_cards
 from ..networks.registry import ModelStore
 from ..run.files import LEFT_OUT
-from ..source.opening import AnySource, FolderSource, Source, VideoSource, open_source
+from ..source.opening import FolderSource, Source, VideoSource, open_source
 from ..system.progress import Progress
 from ..types import Frame, any_of
 
@@ -214,7 +214,7 @@ def grey_of(context: StageContext, masks: FrameMasks, frame: Frame) -> Picture:
     return gray, masks.left_out(frame, gray.shape[1], gray.shape[0])
 
 
-def masks_of(context: StageContext, source: AnySource, faces: Faces | None, rig: Rig) -> FrameMasks:
+def masks_of(context: StageContext, source: Source, faces: Faces | None, rig: Rig) -> FrameMasks:
     """Return the masks of all frames; people only in frames that have been searched."""
     places = context.snapshot / "people", context.snapshot / "picked"
     return FrameMasks(context.config, source, *places, context.threads, faces, rig)

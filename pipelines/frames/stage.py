@@ -26,7 +26,7 @@ from ..sfm.parallax import require_motion
 from ..sfm.rolling import straight_copy
 from ..source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
 from ..source.given import given_poses
-from ..source.opening import AnySource, FolderSource, Source, open_source
+from ..source.opening import FolderSource, Source, open_source
 from ..source.sharpness import reduce_image
 from ..system.parallel import parallel_map
 from ..types import Calibration, Frame, GivenPoses
@@ -198,7 +198,7 @@ def _write_correspondences(context: StageContext, structure: Structure, keyframe
     MATCHED_PAIRS.save(context.folder, tried)
 
 
-def _write_frames(context: StageContext, source: AnySource, frames: list[Frame], lens: Lens) -> None:
+def _write_frames(context: StageContext, source: Source, frames: list[Frame], lens: Lens) -> None:
     """The frames without distortion; those of a lens without any are the picked ones, byte for byte."""
     missing = [f for f in frames if not (context.folder / f.name).exists()]
     if lens.is_straight:
@@ -219,7 +219,7 @@ def _write_frames(context: StageContext, source: AnySource, frames: list[Frame],
     _require_all(context, source, missing)
 
 
-def _require_all(context: StageContext, source: AnySource, frames: list[Frame]) -> None:
+def _require_all(context: StageContext, source: Source, frames: list[Frame]) -> None:
     """The source has given all of these frames again, as they were."""
     try:
         context.same_source()

@@ -18,7 +18,7 @@ from ..sfm.matching import match_features
 from ..sfm.snapshots import Snapshots
 from ..source.faces import Faces, find_faces
 from ..source.given import given_poses, read_intrinsics
-from ..source.opening import AnySource, open_source
+from ..source.opening import Source, open_source
 from ..source.recording import RecordingSource
 from ..source.sharpness import reduced_size
 from ..system.memory import window_size
@@ -28,7 +28,7 @@ from .learned import open_learned, picture_features
 from .masks import FrameMasks, grey_of, masks_of, picked
 
 
-def known_camera(context: StageContext, source: AnySource, faces: Faces | None) -> tuple[pycolmap.Camera, str]:
+def known_camera(context: StageContext, source: Source, faces: Faces | None) -> tuple[pycolmap.Camera, str]:
     """The camera of the reduced frames as far as it is known before, and where from: given by the user, stated by the
     data set, exif, or nowhere."""
     config = context.config.frames

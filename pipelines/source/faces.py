@@ -19,7 +19,7 @@ from ..geometry.camera import CUBE, LEVEL
 from ..sfm.lens import make_lens, to_pycolmap
 from ..types import Intrinsics
 from .given import read_intrinsics
-from .opening import FolderSource, VideoSource
+from .opening import Source, VideoSource
 from .recording import RecordingSource
 from .sharpness import reduced_size
 
@@ -69,7 +69,7 @@ class Faces:
         return cv2.remap(small, *self.maps[camera], how, borderMode=border).astype(np.uint8, copy=False)
 
 
-def find_faces(source: VideoSource | FolderSource | RecordingSource, config: FramesConfig) -> Faces | None:
+def find_faces(source: Source, config: FramesConfig) -> Faces | None:
     """None for images that are a plain camera's already.
 
     Raises InputError for a panorama that is not whole, and a fisheye whose lens is not known where `frames.camera` says
@@ -92,19 +92,19 @@ def find_faces(source: VideoSource | FolderSource | RecordingSource, config: Fra
     return None if lens is None else fisheye_face(lens, config.max_side)
 
 
-def looks_like_panoramas(source: VideoSource | FolderSource | RecordingSource, config: FramesConfig) -> bool:
+def looks_like_panoramas(source: Source, config: FramesConfig) -> bool:
     """Whether the images have the shape of panoramas, and nothing says what they are."""
     unsaid = config.camera == "auto" and not config.intrinsics and not isinstance(source, RecordingSource)
     return unsaid and source.width == 2 * source.height
 
 
-def _said(source: VideoSource | FolderSource | RecordingSource) -> str:
+def _said(source: Source) -> str:
     if isinstance(source, RecordingSource):
         return ""
     return video_sphere(source.files[0]) if isinstance(source, VideoSource) else image_sphere(source.file(0))
 
 
-def _fisheye(source: VideoSource | FolderSource | RecordingSource, config: FramesConfig) -> Camera | None:
+def _fisheye(source: Source, config: FramesConfig) -> Camera | None:
     if config.intrinsics:
         camera: Camera | None = read_intrinsics(config.intrinsics, source.width, source.height)
         if config.camera == "fisheye" and camera is not None:

@@ -16,7 +16,7 @@ from ...formats.reading import file_sha256, files_sha256, home_expanded, reachin
 from ...formats.textfile import read_rows
 from ..config import FramesConfig
 from ..types import Frame, GivenPoses
-from .opening import AnySource, VideoSource, Warn
+from .opening import Source, VideoSource, Warn
 
 _HOW = "give fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file that holds them"
 _MAX_NAMED = 8
@@ -26,7 +26,7 @@ MIN_POSES = 3
 
 
 def given_poses(
-    config: FramesConfig, source: AnySource, frames: Sequence[Frame], warn: Warn | None = None
+    config: FramesConfig, source: Source, frames: Sequence[Frame], warn: Warn | None = None
 ) -> GivenPoses | None:
     """The poses of `frames.poses` frame by frame; None where none are given.
 
@@ -58,7 +58,7 @@ def given_poses(
     return GivenPoses(cam_from_world, file.is_metric, file.kind)
 
 
-def check_poses(config: FramesConfig, source: AnySource) -> None:
+def check_poses(config: FramesConfig, source: Source) -> None:
     """Raise InputError for poses that cannot belong to the source, as far as its names and their number show."""
     if not config.poses:
         return
@@ -79,7 +79,7 @@ def pose_inputs(config: FramesConfig) -> dict[str, str]:
     return {"poses": files_sha256((p.name, p) for p in files)}
 
 
-def _by_name(file: PoseFile, source: AnySource, frames: Sequence[Frame]) -> NDArray[np.float64]:
+def _by_name(file: PoseFile, source: Source, frames: Sequence[Frame]) -> NDArray[np.float64]:
     """A video's frames are called by their numbers."""
     if isinstance(source, VideoSource):
         rows = {frame_number(Path(n.replace(".", "_"))): k for k, n in enumerate(file.names)}
@@ -88,7 +88,7 @@ def _by_name(file: PoseFile, source: AnySource, frames: Sequence[Frame]) -> NDAr
     return _rows(file, [named.get(stem(source.name(f.id, f.source_index))) for f in frames])
 
 
-def _by_order(file: PoseFile, source: AnySource, frames: Sequence[Frame], path: str) -> NDArray[np.float64]:
+def _by_order(file: PoseFile, source: Source, frames: Sequence[Frame], path: str) -> NDArray[np.float64]:
     if source.expected_frames != len(file):
         raise InputError(
             f"--poses {path}: {len(file)} poses for {source.expected_frames} images, and neither names nor times "

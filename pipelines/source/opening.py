@@ -1,61 +1,25 @@
 """The kinds of source, a video file, a folder of images or a data set, read alike."""
 
 import re
-from collections.abc import Callable, Container, Iterator
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Container, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...formats.datasets import Sequence
 from ...formats.errors import InputError, install_command
 from ...formats.image_folder import list_images, read_image_times, times_file
-from ...formats.images import Reading, is_depth_map, read_rgb, read_transparent
+from ...formats.images import is_depth_map
 from ...formats.reading import file_sha256, files_sha256, opened, reaching, require_file
 from ...formats.textfile import read_text
 from ...formats.video import VideoFrame, VideoReader, probe_video
-from .one_camera import Headers, common_span, read_headers, require_one_lens
-from .recording import RecordingSource, open_recording, reusable, written_names
+from .recording import ImageSource, RecordingSource, Warn, open_recording, require_size
 
-Warn = Callable[[str], None]
 LIST_SUFFIX = ".videos"
 _LONGEST_LIST = 100_000
 _PAUSE = 10.0
 """Seconds on the clock of the run between two videos: no velocity goes on from one to the next."""
-
-
-class Source(Protocol):
-    """Images in the order of time, all of one size.
-
-    `expected_frames` is an estimate before reading, 0 = unknown; `has_times` says whether the timestamps are real.
-    """
-
-    width: int
-    height: int
-    expected_frames: int
-    has_times: bool
-
-    def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
-        """Decode from start to end, and hand out the wanted frames (None = all) one at a time."""
-        ...
-
-    def name(self, frame_id: int, index: int) -> str:
-        """File name of picked frame `frame_id`, which is image `index` of the source."""
-        ...
-
-    def original(self, index: int) -> Path | None:
-        """The file of image `index` when it can serve as a frame as it is, else None."""
-        ...
-
-    def exif_focal(self) -> float | None:
-        """Focal length in pixels of the source that its metadata states, or None."""
-        ...
-
-    def transparent(self, index: int) -> NDArray[np.bool_] | None:
-        """(height, width) pixels of image `index` that its alpha channel makes transparent; None without any."""
-        ...
 
 
 @dataclass
@@ -77,12 +41,13 @@ class VideoSource:
         self.expected_frames = sum(i.frame_count_claimed for i in found.values())
 
     def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
-        """See `Source.read`; a truncated or damaged file is reported to `warn` at the end."""
+        """Decode from start to end, and hand out the wanted frames (None = all) one at a time; a truncated or damaged
+        file is reported to `warn` at the end."""
         first, start = 0, 0.0
         for file in self.files:
             with VideoReader(file, None if wanted is None else lambda i, n=first: n + i in wanted) as reader:  # type: ignore[misc]
                 for index, time, rgb in reader:
-                    _require_size(rgb, self.width, self.height, f"frame {index} of {file}")
+                    require_size(rgb, self.width, self.height, f"frame {index} of {file}")
                     yield VideoFrame(first + index, start + time, rgb)
                 if warn is not None:
                     _warn_of_the_file(file, reader, warn)
@@ -93,7 +58,7 @@ class VideoSource:
         return f"{frame_id:06d}.jpg"
 
     def original(self, index: int) -> Path | None:
-        """A video has no files of single frames."""
+        """Return None: a video has no files of single frames."""
         return None
 
     def exif_focal(self) -> float | None:
@@ -117,85 +82,32 @@ def video_files(path: Path) -> tuple[Path, ...]:
     return files
 
 
-@dataclass
-class FolderSource:
+class FolderSource(ImageSource):
     """The images directly in a folder, in natural order of their names; depth maps among them are left out."""
 
-    path: Path
-    width: int = field(init=False)
-    height: int = field(init=False)
-    expected_frames: int = field(init=False)
-    has_times: bool = field(init=False)
-    headers: Headers = field(init=False)
-    _common: int | None = field(init=False)
-    _images: list[Path] = field(init=False)
-    _names: tuple[str, ...] = field(init=False)
+    def __init__(self, path: Path) -> None:
+        images = _without_depth_maps(list_images(path))
+        times = read_image_times(images)
+        stamps = np.arange(len(images), dtype=np.float64) if times is None else times
+        names = tuple(image.name for image in images)
+        super().__init__(Sequence("images", path, names, stamps, tuple(images), timed=times is not None))
 
-    def __post_init__(self) -> None:
-        self._images = _without_depth_maps(list_images(self.path))
-        self._names = written_names([path.name for path in self._images], self.path)
-        self.headers = read_headers(self.path, {path.name: path for path in self._images})
-        self._common = self.headers.common_orientation()
-        sizes = {
-            name: header.size if self._common is None else replace(header, orientation=self._common).size
-            for name, header in self.headers.of.items()
-        }
+    def _require_one_camera(self) -> None:
+        sizes = {name: self._size(header) for name, header in self.headers.of.items()}
         _require_one_size(self.path, sizes, "images")
-        require_one_lens(self.path, self.headers)
-        self.width, self.height = next(iter(sizes.values()))
-        times = read_image_times(self._images)
-        self.has_times = times is not None
-        self._times = np.arange(len(self._images), dtype=np.float64) if times is None else times
-        self.expected_frames = len(self._images)
-
-    def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
-        """See `Source.read`; images that cannot be read are left out and reported to `warn`."""
-        if warn is not None:
-            self.headers.warn(warn)
-        for index, path in enumerate(self._images):
-            if wanted is not None and index not in wanted:
-                continue
-            try:
-                rgb = read_rgb(path, self.reading)
-            except InputError as error:
-                if warn is not None:
-                    warn(f"left out: {error}")
-                continue
-            _require_size(rgb, self.width, self.height, str(path))
-            yield VideoFrame(index, float(self._times[index]), rgb)
-
-    def name(self, frame_id: int, index: int) -> str:
-        """The image's own name; formats that are not written here become .png."""
-        return self._names[index]
-
-    def original(self, index: int) -> Path | None:
-        """The image's file, unless other programs would see it turned, transparent or not at all."""
-        path = self._images[index]
-        return path if reusable(path) and self.reading.orientation in (None, 1) else None
-
-    @cached_property
-    def reading(self) -> Reading:
-        """The rule by which all images become pixels."""
-        return Reading(self._common, common_span(self.headers, {path.name: path for path in self._images}))
-
-    def transparent(self, index: int) -> NDArray[np.bool_] | None:
-        """Return the transparent pixels of image `index`, see `Source.transparent`."""
-        return read_transparent(self._images[index], self.reading)
+        super()._require_one_camera()
 
     def turns_from_upright(self, index: int) -> int:
         """Return the anticlockwise quarter turns by which image `index` differs from its upright view."""
-        return self.headers.turns_from_upright(self._images[index].name, self._common)
+        return self.headers.turns_from_upright(self.sequence.names[index], self._common)
 
     def file(self, index: int) -> Path:
         """The image of that number, however it is turned."""
-        return self._images[index]
-
-    def exif_focal(self) -> float | None:
-        """Return the focal length in pixels that the images state, if any do."""
-        return self.headers.focal_px(self.width, self.height)
+        return self.sequence.image_paths[index]
 
 
-AnySource = VideoSource | FolderSource | RecordingSource
+Source = VideoSource | FolderSource | RecordingSource
+"""`expected_frames` is an estimate before reading, 0 = unknown."""
 
 
 def _without_depth_maps(images: list[Path]) -> list[Path]:
@@ -204,7 +116,7 @@ def _without_depth_maps(images: list[Path]) -> list[Path]:
     return images if len(depth) == len(images) else [path for path in images if path not in depth]
 
 
-def open_source(path: Path, format: str = "auto") -> VideoSource | FolderSource | RecordingSource:
+def open_source(path: Path, format: str = "auto") -> Source:
     """A video file, a folder of images, or a data set (see `open_recording` for the format).
 
     Raises InputError when there is no such file, it is no video, it holds no image, or images differ in size.
@@ -272,14 +184,6 @@ def _require_one_size(folder: Path, sizes: dict[str, tuple[int, int]], what: str
             f"the {what} of {folder} differ in size: {first_name} is {first[0]}x{first[1]}, {others[0]} is "
             f"{width}x{height} ({len(others)} of {len(sizes)} differ from the first): keep the {what} of one camera "
             "and one orientation together"
-        )
-
-
-def _require_size(rgb: NDArray[np.uint8], width: int, height: int, what: str) -> None:
-    if rgb.shape[:2] != (height, width):
-        raise InputError(
-            f"{what} is {rgb.shape[1]}x{rgb.shape[0]}, the images before it are {width}x{height}: convert the source "
-            "to one size first"
         )
 
 

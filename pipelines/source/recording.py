@@ -1,9 +1,10 @@
-"""A data set as a source: images, times and camera as its reader gives them; names of frames, and files that can
-serve as them unchanged."""
+"""Images and data sets as a source: images, times and camera as a reader gives them; names of frames, and files that
+can serve as them unchanged."""
 
 import unicodedata
 from collections.abc import Callable, Container, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...formats.datasets import Camera, Sequence, open_sequence, recognise_source
 from ...formats.errors import InputError
-from ...formats.images import Reading, is_plain, read_rgb, read_transparent
+from ...formats.images import Header, Reading, is_plain, read_rgb, read_transparent
 from ...formats.video import VideoFrame
 from .one_camera import Headers, common_span, read_headers, require_one_lens
 
@@ -33,49 +34,47 @@ def open_recording(path: Path, format: str) -> Sequence | None:
     return None if found is None or found == "images" else open_sequence(path, found)
 
 
-@dataclass
-class RecordingSource:
-    """The frames of a data set; a `Source`. Where the recording has depth or labels is no matter here."""
+class ImageSource:
+    """Images of one size in the order of time: those of a sequence, whatever else that holds.
 
-    sequence: Sequence
-    path: Path = field(init=False)
-    width: int = field(init=False)
-    height: int = field(init=False)
-    expected_frames: int = field(init=False)
-    has_times: bool = field(init=False)
-    _names: tuple[str, ...] = field(init=False)
-    _headers: Headers | None = field(init=False)
-    _reading: Reading = field(init=False)
+    `has_times` says whether the timestamps are real; `headers` are those of the images that can be read.
+    """
 
-    def __post_init__(self) -> None:
-        s = self.sequence
+    def __init__(self, sequence: Sequence) -> None:
+        """Read the headers. Raises InputError where they are not of one camera."""
+        self.sequence = s = sequence
         self.path, self.expected_frames, self.has_times = s.root, len(s), s.timed
         self._names = written_names(s.names, s.root)
-        self._headers, self._reading = None, Reading()
+        self.headers, self._common = Headers({}, {}), None
         if not s.image_paths:
             self.height, self.width = s.rgb(0).shape[:2]
             return
-        images = dict(zip(s.names, s.image_paths, strict=True))
-        self._headers = read_headers(s.root, images)
-        if s.camera is None:
-            require_one_lens(s.root, self._headers)
-        first = next(iter(self._headers.of.values()))
-        common = self._headers.common_orientation()
-        if (
-            common is None
-            and s.camera is not None
-            and _is_shape_of(first.stored, s.camera)
-            and first.size != first.stored
-        ):
-            common = 1  # the program that made the data set has not turned its images
-        self._reading = Reading(common, common_span(self._headers, images))
-        self.width, self.height = first.size if common is None else replace(first, orientation=common).size
+        self.headers = read_headers(s.root, dict(zip(s.names, s.image_paths, strict=True)))
+        self._common = self._orientation()
+        self._require_one_camera()
+        self.width, self.height = self._size(next(iter(self.headers.of.values())))
+
+    def _orientation(self) -> int | None:
+        """The EXIF orientation by which all images are turned; None where each is turned by its own."""
+        return self.headers.common_orientation()
+
+    def _require_one_camera(self) -> None:
+        require_one_lens(self.path, self.headers)
+
+    def _size(self, header: Header) -> tuple[int, int]:
+        return header.size if self._common is None else replace(header, orientation=self._common).size
+
+    @cached_property
+    def reading(self) -> Reading:
+        """The rule by which all images become pixels."""
+        images = dict(zip(self.sequence.names, self.sequence.image_paths, strict=False))
+        return Reading(self._common, common_span(self.headers, images))
 
     def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
-        """See `Source.read`; what the reader notes of the data set, and images that cannot be read, are reported."""
+        """Decode from start to end, and hand out the wanted images (None = all) one at a time; those that cannot be
+        read are left out and reported to `warn`, as is what the headers and the reader of a data set note."""
         if warn is not None:
-            if self._headers is not None:
-                self._headers.warn(warn)
+            self.headers.warn(warn)
             for note in self.sequence.notes:
                 warn(f"{self.sequence.format}: {note}")
         for index in range(len(self.sequence)):
@@ -87,11 +86,7 @@ class RecordingSource:
                 if warn is not None:
                     warn(f"left out: {error}")
                 continue
-            if rgb.shape[:2] != (self.height, self.width):
-                raise InputError(
-                    f"{self.sequence.names[index]} of {self.path} is {rgb.shape[1]}x{rgb.shape[0]}, the first image is "
-                    f"{self.width}x{self.height}: a recording has images of one size; resize or remove it"
-                )
+            require_size(rgb, self.width, self.height, f"{self.sequence.names[index]} of {self.path}")
             yield VideoFrame(index, float(self.sequence.timestamps[index]), rgb)
 
     def name(self, frame_id: int, index: int) -> str:
@@ -101,25 +96,49 @@ class RecordingSource:
     def original(self, index: int) -> Path | None:
         """The image's file, unless other programs would see it turned, transparent or not at all."""
         path = self.sequence.image_paths[index] if self.sequence.image_paths else None
-        return path if path is not None and reusable(path) and self._reading.orientation in (None, 1) else None
+        return path if path is not None and reusable(path) and self.reading.orientation in (None, 1) else None
 
     def transparent(self, index: int) -> NDArray[np.bool_] | None:
-        """Return the transparent pixels of image `index`, see `Source.transparent`."""
+        """(height, width) pixels of image `index` that its alpha channel makes transparent; None without any."""
         paths = self.sequence.image_paths
-        return read_transparent(paths[index], self._reading) if paths else None
+        return read_transparent(paths[index], self.reading) if paths else None
 
     def exif_focal(self) -> float | None:
         """Return the focal length in pixels that the images state, if any do."""
-        return None if self._headers is None else self._headers.focal_px(self.width, self.height)
+        return self.headers.focal_px(self.width, self.height)
 
     def _rgb(self, index: int) -> NDArray[np.uint8]:
         paths = self.sequence.image_paths
-        return read_rgb(paths[index], self._reading) if paths else self.sequence.rgb(index)
+        return read_rgb(paths[index], self.reading) if paths else self.sequence.rgb(index)
+
+
+class RecordingSource(ImageSource):
+    """The frames of a data set. Where the recording has depth or labels is no matter here."""
+
+    def _orientation(self) -> int | None:
+        common, camera = super()._orientation(), self.sequence.camera
+        first = next(iter(self.headers.of.values()))
+        is_turned = common is None and camera is not None and first.size != first.stored
+        # The program that made the data set has not turned its images.
+        return 1 if is_turned and camera is not None and _is_shape_of(first.stored, camera) else common
+
+    def _require_one_camera(self) -> None:
+        if self.sequence.camera is None:
+            super()._require_one_camera()
 
     def known_camera(self) -> Camera | None:
         """The data set's camera at the size of its images."""
         camera = self.sequence.camera
         return None if camera is None else camera.resized(self.width, self.height)
+
+
+def require_size(rgb: NDArray[np.uint8], width: int, height: int, what: str) -> None:
+    """Raise InputError for an image of another size than those before it."""
+    if rgb.shape[:2] != (height, width):
+        raise InputError(
+            f"{what} is {rgb.shape[1]}x{rgb.shape[0]}, the images before it are {width}x{height}: convert the source "
+            "to one size first"
+        )
 
 
 def _is_shape_of(size: tuple[int, int], camera: Camera) -> bool:
