@@ -16,9 +16,7 @@ def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) 
     """Digest of what a stage's result depends on: its code, its settings, the seed, its inputs, what is before."""
     own = config_to_dict(getattr(config, stage.name))
     beside = [] if inputs is None else [inputs]
-    text = json.dumps(
-        [stage.name, stage_identity(stage.name, stage.file), own, config.run.seed, upstream, *beside], sort_keys=True
-    )
+    text = json.dumps([stage.name, stage_identity(stage.file), own, config.run.seed, upstream, *beside], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

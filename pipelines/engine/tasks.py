@@ -285,7 +285,7 @@ def code_identity() -> str:
     """List what results depend on: the program's stages, Python, the libraries that compute; name=version of each."""
     from importlib.metadata import PackageNotFoundError, version
 
-    stages = " ".join(stage_identity(name, stage_file(name)) for name in STAGES)
+    stages = " ".join(stage_identity(stage_file(name)) for name in STAGES)
     program = hashlib.sha256(stages.encode()).hexdigest()
     found = {"msgs-slam": program, "Python": platform.python_version()}
     for name in _COMPUTE:

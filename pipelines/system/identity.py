@@ -2,10 +2,7 @@
 
 The identity is part of a stage's fingerprint. It is a digest of the stage's own sources: its module and all that it
 imports in this project, directly or not, but for `PLUMBING`, which says how a stage is run and not what it computes. A
-comment counts as a change too: a stage run once too often does no harm. At a release `python tests/release.py` writes
-the digests to `stage_versions.toml`, and raises the number of every stage whose sources have changed, unless it is told
-that the results have not. Where the sources are those of the table, the identity is that number, so that a release that
-changes no result of a stage keeps the users' runs; in any other state of the code it is the digest.
+comment counts as a change too: a stage run once too often does no harm.
 
 Libraries are not part of it: another numpy or COLMAP may give other bytes, and does not make a run out of date.
 """
@@ -14,11 +11,9 @@ import functools
 import hashlib
 import os
 import re
-import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-TABLE = Path(__file__).with_name("stage_versions.toml")
 PACKAGE = "msgs_slam"
 """The import name of `ROOT`: of the repository in an editable install, of a folder of site-packages in any other."""
 _IMPORT = re.compile(rb"^\s*from (\.+)([\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
@@ -47,11 +42,9 @@ def stage_file(name: str) -> Path:
 
 
 @functools.cache
-def stage_identity(name: str, file: Path) -> str:
-    """The number of the last release, or a digest of the sources, of the stage whose module is `file`."""
-    digest = source_digest(file)
-    released = tomllib.loads(TABLE.read_text(encoding="utf-8")).get(name, {})
-    return str(released["number"]) if released.get("sources") == digest else digest
+def stage_identity(file: Path) -> str:
+    """Digest of the sources of the stage whose module is `file`, as they were when first asked for."""
+    return source_digest(file)
 
 
 def source_digest(file: Path, root: Path = ROOT) -> str:

@@ -362,7 +362,7 @@ def main() -> None:
     from msgs_slam.pipelines.system.identity import stage_identity
 
     for stage in all_stages():  # what every child would read again
-        stage_identity(stage.name, stage.file)
+        stage_identity(stage.file)
     assert os.waitpid(in_child(lambda: prepare(work)), 0)[1] == 0
     subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "tmpfs", str(disk)], check=True)
     tried = wrong = 0

@@ -124,7 +124,7 @@ def stage_at(run: RunFolder) -> str:
 
 def unbroken(clip: Path, work: Path) -> list[dict[str, str]]:
     """Digests after every round, of a run that nobody kills; kept in `work` for the next call with the same code."""
-    kept, code = work / "whole.json", [stage_identity(s.name, s.file) for s in all_stages()] + [SETTINGS, CHANGES]
+    kept, code = work / "whole.json", [stage_identity(s.file) for s in all_stages()] + [SETTINGS, CHANGES]
     code = json.loads(json.dumps(code))
     if kept.exists() and (found := read_json_object(kept))["code"] == code:
         return found["digests"]

@@ -1,6 +1,5 @@
-"""What code a stage's result depends on, and that a release says so."""
+"""What code a stage's result depends on."""
 
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -8,9 +7,7 @@ import pytest
 from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.engine.stages import Later
 from msgs_slam.pipelines.reconstruct import all_stages
-from msgs_slam.pipelines.system.identity import ROOT, TABLE, source_digest, stage_identity, stage_sources
-
-REPOSITORY = Path(__file__).resolve().parents[3]
+from msgs_slam.pipelines.system.identity import ROOT, source_digest, stage_sources
 
 
 def sources(stage: str) -> set[str]:
@@ -45,32 +42,7 @@ def test_any_change_of_them_is_another_digest(tmp_path: Path) -> None:
     assert source_digest(room / "stage.py", tmp_path) != before
 
 
-def test_a_release_has_the_digests_of_its_sources() -> None:
-    table = tomllib.loads(TABLE.read_text())
-    version = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["version"]
-    if table["release"] != version:
-        assert "dev" in version, "a release needs its numbers: type `python tests/release.py`"
-        pytest.skip(f"{version} is no release: stages are known by the digest of their sources")
-    for name in STAGES:
-        digest = source_digest(ROOT / "pipelines" / name / "stage.py")
-        assert table[name]["sources"] == digest, "the sources have changed: type `python tests/release.py`"
-
-
-def test_identity_is_a_number_only_where_the_sources_are_the_released_ones(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = ROOT / "pipelines" / "export" / "stage.py"
-    digest = source_digest(file)
-    for written, expected in ((digest, "7"), ("0" * 16, digest)):
-        table = tmp_path / f"{expected}.toml"
-        table.write_text(f'[export]\nnumber = 7\nsources = "{written}"\n')
-        monkeypatch.setattr("msgs_slam.pipelines.system.identity.TABLE", table)
-        stage_identity.cache_clear()
-        assert stage_identity("export", file) == expected
-    stage_identity.cache_clear()
-
-
-def test_every_stage_lies_where_the_release_looks_for_it() -> None:
+def test_every_stage_lies_where_its_identity_is_looked_for() -> None:
     for stage in all_stages():
         assert stage.file.resolve() == ROOT / "pipelines" / stage.name / "stage.py"
 
