@@ -88,14 +88,16 @@ def touching(sorted_keys: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray
 
 def find_near(sorted_keys: NDArray[np.int64], keys: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the indices of `find`, with a neighbouring voxel's where a key is missing; a block of these at a time."""
-    shape = keys.shape
-    at, keys = find(sorted_keys, keys).ravel(), keys.ravel()
-    lost = np.flatnonzero((at < 0) & (keys >= 0))
+    flat = keys.ravel()
+    starts = np.flatnonzero(np.diff(flat, prepend=flat[:1] + 1))  # most pixels show what the one before them does
+    runs = flat[starts]
+    at = find(sorted_keys, runs)
+    lost = np.flatnonzero((at < 0) & (runs >= 0))
     for start in range(0, len(lost), _BLOCK // len(_OFFSETS)):
         block = lost[start : start + _BLOCK // len(_OFFSETS)]
-        around = find(sorted_keys, neighbour_keys(keys[block]))
+        around = find(sorted_keys, neighbour_keys(runs[block]))
         at[block] = around[np.arange(len(block)), (around >= 0).argmax(1)]
-    return at.reshape(shape)
+    return np.repeat(at, np.diff(starts, append=len(flat))).reshape(keys.shape)
 
 
 def normals_in_cam(depth: NDArray[np.float32], intrinsics: Intrinsics) -> NDArray[np.float64]:

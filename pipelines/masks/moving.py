@@ -152,19 +152,21 @@ def _evidence(
 
 
 @kernel
-def _nearest(depth: NDArray, view_from_other: NDArray[np.float64], lens: NDArray[np.float64]) -> NDArray[np.int64]:
-    """(h, w) number of the pixel of another view that shows the nearest surface at each of this one's; -1 for none."""
+def _nearest(depth: NDArray, m: NDArray[np.float64], lens: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(h, w) number of the pixel of another view that shows the nearest surface at each of this one's; -1 for none.
+    m (4, 4): view_from_other."""
     height, width = depth.shape
     source = np.full((height, width), -1, np.int64)
     front = np.full((height, width), np.inf)
     fx, fy, cx, cy = lens
-    turn, shift = np.ascontiguousarray(view_from_other[:3, :3]), view_from_other[:3, 3]
     for y in range(height):
         for x in range(width):
             if depth[y, x] <= 0:
                 continue
-            away = (x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy
-            px, py, pz = depth[y, x] * (turn[:, 0] * away[0] + turn[:, 1] * away[1] + turn[:, 2]) + shift
+            right, down = (x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy
+            px = depth[y, x] * (m[0, 0] * right + m[0, 1] * down + m[0, 2]) + m[0, 3]
+            py = depth[y, x] * (m[1, 0] * right + m[1, 1] * down + m[1, 2]) + m[1, 3]
+            pz = depth[y, x] * (m[2, 0] * right + m[2, 1] * down + m[2, 2]) + m[2, 3]
             column, row = np.floor(fx * px / pz + cx), np.floor(fy * py / pz + cy)
             if pz > 0 and 0 <= column < width and 0 <= row < height and pz <= front[int(row), int(column)]:
                 front[int(row), int(column)] = pz

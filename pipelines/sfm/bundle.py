@@ -254,8 +254,8 @@ def adjust_pose(
     points = np.ascontiguousarray(points)
     cost, damping = kernels.total_cost(motion[None], points, data), 1e-4
     for _ in range(iterations):
-        block, right, *_ = kernels.linearise(motion[None], points, data)
-        step = np.linalg.solve(block[0] + np.diag(damping * np.diag(block[0]) + 1e-9), right[0])
+        block, right = kernels.linearise_camera(motion[None], points, data)
+        step = np.linalg.solve(block + np.diag(damping * np.diag(block) + 1e-9), right)
         moved = se3.exp(step) @ motion
         tried = kernels.total_cost(moved[None], points, data)
         if tried < cost:

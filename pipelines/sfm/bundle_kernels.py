@@ -18,17 +18,25 @@ MIN_DEPTH = 1e-6
 """Relative to nothing: a point behind the camera is treated as an outlier of zero weight."""
 
 
-@kernel
-def _residual(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, residual, jac_cam, jac_point):  # type: ignore[no-untyped-def]
-    """Fill residual (3,), its derivatives by twist (3, 6) and point (3, 3); False if behind the camera."""
+@kernel(inline="always")
+def _offset(motion, point, camera, xy, inverse_sd):  # type: ignore[no-untyped-def]
+    """Point in the camera, and its two residuals from a pixel: no numbers unless it is before the camera."""
     x = motion[0, 0] * point[0] + motion[0, 1] * point[1] + motion[0, 2] * point[2] + motion[0, 3]
     y = motion[1, 0] * point[0] + motion[1, 1] * point[1] + motion[1, 2] * point[2] + motion[1, 3]
     z = motion[2, 0] * point[0] + motion[2, 1] * point[1] + motion[2, 2] * point[2] + motion[2, 3]
+    iz = 1.0 / z
+    right = (camera[0] * x * iz + camera[2] - xy[0]) * inverse_sd
+    down = (camera[1] * y * iz + camera[3] - xy[1]) * inverse_sd
+    return x, y, z, right, down
+
+
+@kernel
+def _residual(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, residual, jac_cam, jac_point):  # type: ignore[no-untyped-def]
+    """Fill residual (3,), its derivatives by twist (3, 6) and point (3, 3); False if behind the camera."""
+    x, y, z, residual[0], residual[1] = _offset(motion, point, camera, xy, inverse_sd)
     if z <= MIN_DEPTH:
         return False
     iz = 1.0 / z
-    residual[0] = (camera[0] * x * iz + camera[2] - xy[0]) * inverse_sd
-    residual[1] = (camera[1] * y * iz + camera[3] - xy[1]) * inverse_sd
     residual[2] = (np.log(z) - log_depth) * depth_weight
     a, b = camera[0] * iz * inverse_sd, camera[1] * iz * inverse_sd
     for i in range(3):
@@ -96,13 +104,22 @@ def _cauchy_weight(squared, width):  # type: ignore[no-untyped-def]
 @kernel
 def total_cost(motions, points, data):  # type: ignore[no-untyped-def]
     """Robust cost of all observations; one behind its camera costs what a residual of ten widths does."""
-    obs_cam, width, row, cost = data[1], data[8], _scratch(), 0.0
-    residual = row[0]
+    camera, obs_cam, obs_point, source, xy, inverse_sd, log_depth, depth_weight, width = data
+    cost = 0.0
     for o in range(len(obs_cam)):
-        if _observe(o, motions, points, data, row):
-            cost += _cauchy(residual[0] ** 2 + residual[1] ** 2, width) + _cauchy(residual[2] ** 2, width)
-        else:
+        point, s = points[obs_point[o]], source[o]
+        _, _, z, right, down = _offset(motions[obs_cam[o]], point, camera, xy[o], inverse_sd[o])
+        nearest = z
+        if s >= 0:
+            _, _, there, right_there, down_there = _offset(motions[obs_cam[s]], point, camera, xy[s], inverse_sd[o])
+            nearest, right, down = min(z, there), right - right_there, down - down_there
+        if nearest <= MIN_DEPTH:
             cost += _cauchy(100.0 * width * width, width)
+            continue
+        seen = _cauchy(right**2 + down**2, width)
+        if depth_weight[o] != 0.0:
+            seen += _cauchy(((np.log(z) - log_depth[o]) * depth_weight[o]) ** 2, width)
+        cost += seen
     return cost
 
 
@@ -155,6 +172,17 @@ def linearise(motions, points, data):  # type: ignore[no-untyped-def]
             _add_product(weight, jac_source, jac_source, cam_block[obs_cam[s]])
             _subtract_gradient(weight, jac_source, residual, cam_right[obs_cam[s]])
     return cam_block, cam_right, point_block, point_right
+
+
+@kernel
+def linearise_camera(motion, points, data):  # type: ignore[no-untyped-def]
+    """Block (6, 6) and right side (6,) of one camera (1, 4, 4) among points that stay."""
+    row, block, right = _scratch(), np.zeros((6, 6)), np.zeros(6)
+    for o in range(len(data[1])):
+        _weighted(o, motion, points, data, row)
+        _add_product(row[4], row[1], row[1], block)
+        _subtract_gradient(row[4], row[1], row[0], right)
+    return block, right
 
 
 @kernel

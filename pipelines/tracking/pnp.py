@@ -30,6 +30,9 @@ POSE_ERROR = 3.0
 """Pixels within which a point agrees with a frame's pose."""
 MIN_INLIERS = 20
 """A frame with fewer agreeing points is lost."""
+_NEARLY_ALL, _ENOUGH = 0.8, 50
+"""Share and number of points that agree with where a frame was expected, from which nobody asks for another pose: of
+254 frames of a kitchen RANSAC then found none better in 249, and one or two of 1270 points more in 5."""
 
 
 @dataclass(frozen=True)
@@ -57,21 +60,21 @@ def solve_pose(
 ) -> FramePose | None:
     """RANSAC on minimal sets (pycolmap), then motion-only robust adjustment; None where no pose explains six points.
 
-    xy (Q, 2) pixels, points (Q, 3) in the world. A `start` (4, 4) is adjusted too and wins when it explains as many.
+    xy (Q, 2) pixels, points (Q, 3) in the world. A `start` (4, 4) is adjusted too and wins when it explains as many;
+    where it explains nearly all there is no need of RANSAC.
     """
-    candidates = []
-    if start is not None and len(xy) >= 6:
-        candidates.append(start)
-    if len(xy) >= 6:
-        options = pycolmap.AbsolutePoseEstimationOptions()
-        options.ransac.max_error = max_error
-        options.ransac.random_seed = seed
-        options.ransac.min_num_trials, options.ransac.max_num_trials = 50, 2000
-        found = pycolmap.estimate_absolute_pose(xy, points, colmap_camera(intrinsics), options)
-        if found is not None:
-            candidates.append(np.vstack([found["cam_from_world"].matrix(), [0, 0, 0, 1]]))
-    best: FramePose | None = None
-    for motion in candidates:
+    if len(xy) < 6:
+        return None
+    best = None if start is None else _settle(start, xy, points, intrinsics, max_error, sd)
+    if best is not None and best.inliers.sum() >= max(_ENOUGH, _NEARLY_ALL * len(xy)):
+        return best
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error = max_error
+    options.ransac.random_seed = seed
+    options.ransac.min_num_trials, options.ransac.max_num_trials = 50, 2000
+    found = pycolmap.estimate_absolute_pose(xy, points, colmap_camera(intrinsics), options)
+    if found is not None:
+        motion = np.vstack([found["cam_from_world"].matrix(), [0, 0, 0, 1]])
         adjusted = _settle(motion, xy, points, intrinsics, max_error, sd)
         if adjusted is not None and (best is None or adjusted.inliers.sum() > best.inliers.sum()):
             best = adjusted

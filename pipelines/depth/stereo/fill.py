@@ -49,6 +49,8 @@ _MIN_SLOPE, _MAX_SLOPE = 0.5, 1.6
 _MIN_PIXELS = 40
 _FLAT_CONFIDENCE, _GUESS_CONFIDENCE = 0.2, 0.03
 _KNOWN_MASS = 1e-3
+_FACTORS = 9
+"""Sums that fix a plane, see `_write_votes`."""
 
 
 def smooth_confidence(confidence: NDArray[np.float32], image: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -98,30 +100,54 @@ def fill_unsure(
 def _local_planes(inverse: Array, weight: Array, image: NDArray[np.uint8]) -> tuple[Array, Array]:
     """(h, w) inverse depth of the plane through the evidence around each pixel (in a picture, the inverse depth of a
     plane is linear), and the evidence's mass: weighted least squares whose weights fade along like colours."""
-    height, width = inverse.shape
-    side = max(height, width)
-    y, x = np.mgrid[:height, :width] / side
-    one = np.ones_like(x)
-    factors = ((one, one), (x, one), (y, one), (x, x), (x, y), (y, y), (inverse, one), (inverse, x), (inverse, y))
-    votes, sums = np.empty((height, width, len(factors)), np.float32), np.zeros((height, width, len(factors)))
-    for k, (a, b) in enumerate(factors):
-        votes[..., k] = weight * (a * b)
+    side = max(inverse.shape)
+    votes, sums = np.empty((*inverse.shape, _FACTORS), np.float32), np.zeros((*inverse.shape, _FACTORS))
+    _write_votes(inverse, weight, side, votes)
     for reach, color_sd, share in _REACHES:
-        spread = spread_votes(votes, image, reach * side, color_sd)
-        for k in range(len(factors)):  # one by one: all as float64 were the most memory that the stage needed
-            sums[..., k] += share * spread[..., k].astype(np.float64)
+        _add(share, spread_votes(votes, image, reach * side, color_sd), sums)
     mass = sums[..., 0].copy()
-    for k in range(len(factors)):
-        sums[..., k] += _ANYWHERE * _spread_anywhere(votes[..., k]).astype(np.float64)
-    total = np.maximum(sums[..., 0], 1e-30)
-    sums[..., 1:] /= total[..., None]
-    mx, my, xx, xy, yy, mean, xv, yv = np.moveaxis(sums[..., 1:], -1, 0)
-    xx, yy, xy = xx - mx * mx + _RIDGE, yy - my * my + _RIDGE, xy - mx * my
-    xv, yv = xv - mx * mean, yv - my * mean
-    determinant = xx * yy - xy * xy
-    slope_x, slope_y = (yy * xv - xy * yv) / determinant, (xx * yv - xy * xv) / determinant
-    plane = mean + slope_x * (x - mx) + slope_y * (y - my)
-    return np.clip(plane, _MIN_SLOPE * mean, _MAX_SLOPE * mean), mass
+    for k in range(_FACTORS):
+        votes[..., k] = _spread_anywhere(votes[..., k])
+    _add(_ANYWHERE, votes, sums)
+    _fit_planes(sums, side, guess := np.empty_like(inverse))
+    return guess, mass
+
+
+@kernel
+def _write_votes(inverse: Array, weight: Array, side: int, votes: NDArray[np.float32]) -> None:
+    """What each pixel says of the plane: its weight times 1, x, y, x², xy, y², v, vx and vy, v the inverse depth."""
+    for row in range(inverse.shape[0]):
+        for column in range(inverse.shape[1]):
+            x, y, v, w, out = column / side, row / side, inverse[row, column], weight[row, column], votes[row, column]
+            out[0], out[1], out[2] = w, w * x, w * y
+            out[3], out[4], out[5] = w * (x * x), w * (x * y), w * (y * y)
+            out[6], out[7], out[8] = w * v, w * (v * x), w * (v * y)
+
+
+@kernel
+def _add(share: float, votes: NDArray[np.float32], sums: Array) -> None:
+    """Add a share of float32 numbers to float64 ones, without a copy of either."""
+    flat, into = votes.reshape(-1), sums.reshape(-1)
+    for i in range(len(flat)):
+        into[i] += share * np.float64(flat[i])
+
+
+@kernel
+def _fit_planes(sums: Array, side: int, guess: Array) -> None:
+    """The inverse depth (h, w) of the plane of each pixel's sums (h, w, 9), those of `_write_votes`."""
+    for row in range(sums.shape[0]):
+        for column in range(sums.shape[1]):
+            own = sums[row, column]
+            total = max(own[0], 1e-30)
+            mx, my, mean = own[1] / total, own[2] / total, own[6] / total
+            xx = own[3] / total - mx * mx + _RIDGE
+            yy = own[5] / total - my * my + _RIDGE
+            xy = own[4] / total - mx * my
+            xv, yv = own[7] / total - mx * mean, own[8] / total - my * mean
+            determinant = xx * yy - xy * xy
+            slope_x, slope_y = (yy * xv - xy * yv) / determinant, (xx * yv - xy * xv) / determinant
+            plane = mean + slope_x * (column / side - mx) + slope_y * (row / side - my)
+            guess[row, column] = min(max(plane, _MIN_SLOPE * mean), _MAX_SLOPE * mean)
 
 
 def _spread_anywhere(votes: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -245,16 +271,23 @@ def spread_votes(
 
 def spread_in_place(votes: NDArray[np.float32], image: NDArray[np.uint8], reach: float, color_sd: float) -> None:
     """Do what `spread_votes` does to votes that nobody else has, without a second copy of all classes."""
+    across, down = (_color_steps(image, axis) for axis in (1, 0))
     for iteration in range(2):
         fade = np.exp(-np.sqrt(2.0) / (reach * 0.5**iteration))
-        _pass_rows(votes, _fading(image, 1, fade, reach / color_sd))
-        _pass_columns(votes, _fading(image, 0, fade, reach / color_sd))
+        _pass_rows(votes, _fading(across, 1, fade, reach / color_sd))
+        _pass_columns(votes, _fading(down, 0, fade, reach / color_sd))
 
 
-def _fading(image: NDArray[np.uint8], axis: int, fade: float, stretch: float) -> NDArray[np.float32]:
-    """(h, w) how much of a vote is left after the step from the pixel before along the axis; the first are 0."""
-    red, green, blue = np.moveaxis(np.abs(np.diff(image.astype(np.float32), axis=axis)), -1, 0)
-    left = np.power(np.float32(fade), 1 + np.float32(stretch) * (red + green + blue))
+def _color_steps(image: NDArray[np.uint8], axis: int) -> NDArray[np.float32]:
+    """Colour steps along an axis, one fewer than there are pixels: differences of the three channels, summed."""
+    first, second = (image[:, :-1], image[:, 1:]) if axis == 1 else (image[:-1], image[1:])
+    red, green, blue = cv2.split(cv2.absdiff(first, second))
+    return red.astype(np.float32) + green + blue
+
+
+def _fading(steps: NDArray[np.float32], axis: int, fade: float, stretch: float) -> NDArray[np.float32]:
+    """(h, w) how much of a vote is left after the colour step from the pixel before along the axis; the first are 0."""
+    left = np.power(np.float32(fade), 1 + np.float32(stretch) * steps)
     return np.asarray(np.insert(left, 0, 0, axis=axis), np.float32)
 
 

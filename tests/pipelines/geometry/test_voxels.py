@@ -22,6 +22,7 @@ def test_a_missing_voxel_is_answered_by_one_that_touches_it(missing: int) -> Non
     found = voxels.find_near(there, asked)
     assert found.shape == asked.shape
     np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(voxels.find_near(there, np.repeat(asked, 3, axis=1)), np.repeat(expected, 3, axis=1))
     if missing > 1:
         outside = voxels.cells_of(asked.ravel()[8:]).min(1) < -1  # touches nothing
         assert outside.any()

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
 from msgs_slam.pipelines.geometry import se3
@@ -97,6 +98,28 @@ def test_pose_from_points_survives_outliers_and_repeats(known_bundle: KnownBundl
     again = solve_pose(xy, points, camera, seed=1)
     assert again is not None
     assert again.cam_from_world.tobytes() == solved.cam_from_world.tobytes()
+
+
+def test_an_expected_pose_that_explains_nearly_all_points_is_not_sought_again(
+    known_bundle: KnownBundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, estimate = [], pycolmap.estimate_absolute_pose
+    monkeypatch.setattr(pycolmap, "estimate_absolute_pose", lambda *a: asked.append(len(a[0])) or estimate(*a))
+    rng = np.random.default_rng(0)
+    truth, points, camera = known_bundle.cam_from_world[2], known_bundle.points, known_bundle.intrinsics
+    xy, _ = project(points @ truth[:3, :3].T + truth[:3, 3], camera)
+    xy = xy + rng.normal(size=xy.shape) * 0.3
+    near = se3.exp(np.array([0.02, 0, 0, 0, 0.01, 0])) @ truth
+    solved = solve_pose(xy, points, camera, seed=1, start=near)
+    assert not asked
+    assert solved is not None
+    assert solved.inliers.mean() > 0.97
+    assert 0 < np.linalg.norm(se3.log(solved.cam_from_world @ se3.inverse(truth))) < 0.01
+    far = se3.exp(np.array([0, 0, 0, 0, 0.6, 0])) @ truth
+    again = solve_pose(xy, points, camera, seed=1, start=far)
+    assert asked
+    assert again is not None
+    assert again.inliers.mean() > 0.97
 
 
 def test_no_pose_from_nonsense() -> None:
