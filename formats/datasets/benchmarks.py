@@ -30,7 +30,7 @@ from .matching import (
     read_timed_files,
     sequence_of,
 )
-from .sequence import Camera, LabelClass, Sequence, read_classes_json
+from .sequence import Camera, LabelClass, Sequence, known_classes
 
 _CLASS_FOLDERS = ("semantic_class", "semantic_classes")
 
@@ -274,5 +274,5 @@ def _classes(path: Path, label_paths: tuple[Path | None, ...]) -> tuple[LabelCla
     files = [p / "info_semantic.json" for p in places]
     files += [p.parent / "semantic_info" / p.name / "info_semantic.json" for p in places]
     file = next((f for f in files if f.is_file()), None)
-    classes = classes_found(label_paths) if file is None else read_classes_json(file)
+    classes = classes_found(label_paths) if file is None else known_classes(file)
     return tuple(c for c in classes if c.id != 0)

@@ -11,7 +11,7 @@ from ..textfile import read_rows
 from ..trajectory import read_matrices, read_tum
 from .calibration import read_intrinsics_json
 from .matching import classes_found, files_for_images, poses_at, poses_for_images, sequence_of, times_or_frame_numbers
-from .sequence import Camera, LabelClass, Sequence, read_classes_json
+from .sequence import Camera, LabelClass, Sequence, known_classes
 
 _IMAGE_FOLDERS = ("rgb", "images", "color", "frames")
 _DEPTH_FOLDERS = ("depth", "depths")
@@ -114,4 +114,4 @@ def _classes(root: Path, label_paths: tuple[Path | None, ...]) -> tuple[LabelCla
     if not label_paths:
         return ()
     path = root / "classes.json"
-    return read_classes_json(path) if path.is_file() else classes_found(label_paths)
+    return known_classes(path) if path.is_file() else classes_found(label_paths)

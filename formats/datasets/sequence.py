@@ -13,12 +13,16 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..images import read_depth_png, read_label_png, read_rgb
-from ..textfile import read_json_object, read_text
+from ..reading import parsing
+from ..textfile import read_json, read_text
 
 _TABLE_NAME = "scannetv2-labels.combined.tsv"
 _LEVELS_UP = 4
 
 _VOID_NAMES = frozenset({"none", "void", "undefined", "unlabeled", "unlabelled", "unknown", "ignore"})
+_CLASS_TABLES = ("classes.json", "info_semantic.json", "classes.txt", "labels.txt", "classes_used.txt")
+_MAX_TABLE_BYTES = 16 << 20
+MAX_ID = 65535
 
 _LARGEST_SIDE = 65535
 _FOCAL_SIDES = 100
@@ -42,6 +46,11 @@ class LabelClass:
     name: str
     color: tuple[int, int, int] | None = None
     other_ids: tuple[int, ...] = ()
+
+    @property
+    def is_void(self) -> bool:
+        """Whether it is what is no class."""
+        return self.name.strip().lower() in _VOID_NAMES
 
 
 class FrameStore(Protocol):
@@ -267,31 +276,60 @@ def warp_nearest(image: NDArray[np.float32], source: Camera, target: Camera) -> 
     return np.where(inside_y[:, None] & inside_x[None, :], warped, np.float32(0)).astype(np.float32)
 
 
-def read_classes_json(path: Path) -> tuple[LabelClass, ...]:
-    """Read the classes of `{"classes": [{"id": 3, "name": "sofa", "color": [r, g, b]}, ...]}` by id, without the void
-    ones.
+def known_classes(path: Path) -> tuple[LabelClass, ...]:
+    """Read the classes of a table by their ids, without the void ones. Raises InputError as `read_class_table`."""
+    return tuple(c for _, c in sorted(read_class_table(path).items()) if not c.is_void)
 
-    The colour may be missing. Void is what is named so (none, void, undefined, unlabeled, unknown, ignore).
-    Raises InputError for another shape, an id outside 0..65535, or an id that occurs twice.
+
+def find_class_table(label_folder: Path) -> Path | None:
+    """The table in the label folder or the one above it; None when there is none."""
+    candidates = (folder / name for folder in (label_folder, label_folder.parent) for name in _CLASS_TABLES)
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def read_class_table(path: Path) -> dict[int, LabelClass]:
+    """id → class. JSON: {"classes": [{"id", "name", "color"?}]}, such a list, a list of names, or {"id": "name"};
+    text: a name a line (ids from 0) up to the first empty line, or `id name [anything]` a line; # begins a comment.
+    Raises InputError.
     """
-    entries = read_json_object(path).get("classes")
-    if not isinstance(entries, list) or not entries:
-        raise InputError(f'{path} has no list "classes": expected [{{"id": 1, "name": "wall"}}, ...]')
-    classes = sorted((_class_of(entry, path) for entry in entries), key=lambda c: c.id)
-    ids = [c.id for c in classes]
-    if len(set(ids)) != len(ids):
-        raise InputError(f"{path}: a class id occurs twice: give each class its own")
-    return tuple(c for c in classes if c.name.lower() not in _VOID_NAMES)
+    stored = read_json(path, _MAX_TABLE_BYTES) if path.suffix == ".json" else read_text(path, _MAX_TABLE_BYTES)
+    with parsing(path, "table of classes", "write a list of {id, name}"):
+        table = _from_text(stored) if isinstance(stored, str) else _from_json(stored)
+    if not table or min(table) < 0 or max(table) > MAX_ID:
+        raise InputError(f"{path}: class ids must be in 0..{MAX_ID} and at least one is needed")
+    return table
 
 
-def _class_of(entry: Any, path: Path) -> LabelClass:
-    id, name = (entry.get("id"), entry.get("name")) if isinstance(entry, dict) else (None, None)
-    if isinstance(id, bool) or not isinstance(id, int) or not 0 <= id <= 65535 or not isinstance(name, str):
-        raise InputError(f"{path}: {str(entry)[:80]} is no class: expected an id in 0..65535 and a name")
-    color = entry.get("color")
-    if not (isinstance(color, list) and len(color) == 3 and all(isinstance(v, int) and 0 <= v <= 255 for v in color)):
-        return LabelClass(id, name)
-    return LabelClass(id, name, (color[0], color[1], color[2]))
+def _from_json(value: Any) -> dict[int, LabelClass]:
+    if isinstance(value, dict) and "classes" in value:
+        value = value["classes"]
+    if isinstance(value, dict):
+        return {int(k): LabelClass(int(k), str(v)) for k, v in value.items()}
+    if not isinstance(value, list):
+        raise ValueError("it lists no classes")
+    table: dict[int, LabelClass] = {}
+    for i, row in enumerate(value):
+        found = LabelClass(i, row) if isinstance(row, str) else _class_of(row)
+        if table.setdefault(found.id, found) is not found:
+            raise ValueError(f"the class id {found.id} occurs twice")
+    return table
+
+
+def _class_of(row: Any) -> LabelClass:
+    color = row.get("color")
+    is_rgb = isinstance(color, list) and len(color) == 3 and all(isinstance(v, int | float) for v in color)
+    red, green, blue = (min(max(int(v), 0), 255) for v in color) if is_rgb else (0, 0, 0)
+    return LabelClass(int(row["id"]), str(row["name"]), (red, green, blue) if is_rgb else None)
+
+
+def _from_text(text: str) -> dict[int, LabelClass]:
+    lines = [line.split("#")[0].strip() for line in text.strip().splitlines() if not line.startswith("#")]
+    # Prose may follow the names after an empty line, as in the lists that come with some networks.
+    lines = lines[: lines.index("")] if "" in lines else lines
+    rows = [line.split() for line in lines]
+    if all(len(r) >= 2 and r[0].isdecimal() for r in rows):
+        return {int(r[0]): LabelClass(int(r[0]), r[1]) for r in rows}
+    return {i: LabelClass(i, line) for i, line in enumerate(lines)}
 
 
 def find_label_table(path: Path) -> Path | None:

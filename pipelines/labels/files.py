@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...formats.datasets.sequence import MAX_ID, LabelClass, find_class_table, read_class_table
 from ...formats.errors import InputError
 from ...formats.images import read_label_png
 from ..depth.files import as_read, find_folder, match_files, require_aspect
 from ..geometry.camera import resample_nearest
-from ..networks.card import MAX_ID, NamedClass, find_class_table, read_class_table
 from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, Sequence, class_colors
 from ..system.progress import Progress
 from ..types import VOID, ClassTable, Frame
@@ -78,8 +78,8 @@ class FilesLabels(SemanticsProvider):
         if not any(i in (table := self._table_of(ids)) and not table[i].is_void for ids in found for i in ids):
             raise self._no_class()
 
-    def _table_of(self, ids: list[int]) -> dict[int, NamedClass]:
-        return self._table or {i: NamedClass(f"class {i}") for i in ids if i not in (VOID, MAX_ID)}
+    def _table_of(self, ids: list[int]) -> dict[int, LabelClass]:
+        return self._table or {i: LabelClass(i, f"class {i}") for i in ids if i not in (VOID, MAX_ID)}
 
     def _no_class(self) -> InputError:
         what = f"the ids that {self._table_file} names" if self._table_file else "ids below 255"

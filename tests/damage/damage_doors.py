@@ -30,7 +30,7 @@ from tokenizers import models as tokenizer_models
 from msgs_slam.formats.colmap import read_colmap_model, write_colmap_model
 from msgs_slam.formats.datasets import Camera, Sequence, open_sequence, recognise_source
 from msgs_slam.formats.datasets.calibration import read_intrinsics_json
-from msgs_slam.formats.datasets.sequence import read_classes_json, read_nyu40_classes
+from msgs_slam.formats.datasets.sequence import read_class_table, read_nyu40_classes
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gaussians import GaussianCloud
 from msgs_slam.formats.image_folder import (
@@ -60,7 +60,7 @@ from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.depth.files import _read as read_depth_file
 from msgs_slam.pipelines.evaluation.labels import read_class_map
 from msgs_slam.pipelines.frames.masks import open_masks
-from msgs_slam.pipelines.networks.card import Card, read_card, read_class_table
+from msgs_slam.pipelines.networks.card import Card, read_card
 from msgs_slam.pipelines.networks.network_pass import ResultCache
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.networks.session import Network
@@ -516,7 +516,6 @@ DOORS: dict[str, Door] = {
         text("ros.yaml", "camera_matrix:\n  data: [500, 0, 320, 0, 501, 240, 0, 0, 1]\n"),
         lambda p: judge_camera(read_intrinsics(str(p), 640, 480)), "ros.yaml", in_text,
     ),
-    "classes": Door(make_truth, read_classes_json, "classes.json", in_json, "classes.json"),
     "class table, JSON": Door(make_truth, read_class_table, "classes.json", in_json, "classes.json"),
     "class table, text": Door(text("labels.txt", "0 wall x\n1 sofa\n2 floor\n"), read_class_table, "labels.txt"),
     "ScanNet's label table": Door(text("t.tsv", NYU), read_nyu40_classes, "t.tsv"),

@@ -9,11 +9,11 @@ import pytest
 from PIL import Image
 from proxy_room import Room, write_source
 
+from msgs_slam.formats.datasets.sequence import find_class_table, read_class_table
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
 from msgs_slam.pipelines.depth.files import FilesDepth, frame_key
 from msgs_slam.pipelines.labels.files import FilesLabels
-from msgs_slam.pipelines.networks.card import find_class_table, read_class_table
 from msgs_slam.pipelines.providers import DepthEstimate, Sequence
 from msgs_slam.pipelines.proxy.inputs import _before_frames, check_proxy
 from msgs_slam.pipelines.proxy.selection import (
