@@ -2,14 +2,13 @@
 
 from pathlib import Path
 
-import onnx
 import pytest
 from click.testing import CliRunner, Result
-from onnx import TensorProto, helper
 
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.networks import download
 from msgs_slam.pipelines.networks.registry import ModelStore
+from tests.networks import save_network
 
 
 @pytest.fixture
@@ -23,12 +22,8 @@ def models(*arguments: object) -> Result:
 
 
 def write_network(path: Path, output: str) -> Path:
-    node = helper.make_node("ReduceMean", ["pixel_values"], [output], axes=[1], keepdims=0)
-    x = helper.make_tensor_value_info("pixel_values", TensorProto.FLOAT, [1, 3, "h", "w"])
-    y = helper.make_tensor_value_info(output, TensorProto.FLOAT, [1, "h", "w"])
-    graph = helper.make_graph([node], "net", [x], [y])
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
-    return path
+    mean = f"{output} = ReduceMean <axes = [1], keepdims = 0> (pixel_values)"
+    return save_network(path, "float[1, 3, h, w] pixel_values", f"float[1, h, w] {output}", mean)
 
 
 def test_list_says_size_licence_and_what_is_not_pinned(cache: Path) -> None:

@@ -16,11 +16,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-import onnx
 import torch
 from damage_mutate import Mutator, in_json, in_ply, in_text, in_zip, with_json_head
 from layouts import LAYOUTS
-from onnx import TensorProto, helper
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from tiny_tflite import write_tflite
@@ -70,6 +68,7 @@ from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.viewer.scene import load_scenes
 from tests.colmap_models import posed_images
 from tests.matrices import write_matrices
+from tests.networks import save_network
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 4
 
@@ -420,16 +419,8 @@ size = [24, 32]
 
 
 def make_onnx(folder: Path) -> None:
-    weight = onnx.numpy_helper.from_array(np.full((1, 3, 1, 1), 0.3, np.float32), "w")
-    ports = [
-        helper.make_tensor_value_info(n, TensorProto.FLOAT, [1, c, 24, 32]) for n, c in (("image", 3), ("scores", 1))
-    ]
-    graph = helper.make_graph(
-        [helper.make_node("Conv", ["image", "w"], ["scores"])], "g", ports[:1], ports[1:], [weight]
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
-    model.ir_version = 8
-    onnx.save(model, folder / "net.onnx")
+    ports = "float[1, 3, 24, 32] image", "float[1, 1, 24, 32] scores"
+    save_network(folder / "net.onnx", *ports, "scores = Conv (image, w)", w=np.full((1, 3, 1, 1), 0.3))
     rest = "canonical_focal = 1000.0\nvalid = [0.1, 200.0]"
     (folder / "card.toml").write_text(CARD.format(task="depth", model="net.onnx", rest=rest))
 

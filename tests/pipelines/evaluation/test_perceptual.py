@@ -21,6 +21,7 @@ from msgs_slam.pipelines.evaluation.write import evaluation_table
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
+from tests.networks import save_network
 
 OracleRun = Callable[..., RunFolder]
 
@@ -80,17 +81,9 @@ def test_why_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def save_measure(path: Path, inputs: tuple[str, str] = ("image0", "image1")) -> None:
     """An ONNX file with the contract of `lpips-alex` that gives the mean distance."""
-    from onnx import TensorProto, helper, save
-
-    ports = [helper.make_tensor_value_info(n, TensorProto.FLOAT, [1, 3, "h", "w"]) for n in inputs]
-    out = helper.make_tensor_value_info("distance", TensorProto.FLOAT, [])
-    nodes = [
-        helper.make_node("Sub", list(inputs), ["difference"]),
-        helper.make_node("Abs", ["difference"], ["size"]),
-        helper.make_node("ReduceMean", ["size"], ["distance"], keepdims=0),
-    ]
-    graph = helper.make_graph(nodes, "distance", ports, [out])
-    save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
+    nodes = f"difference = Sub ({', '.join(inputs)})", "size = Abs (difference)"
+    ports = ", ".join(f"float[1, 3, h, w] {name}" for name in inputs)
+    save_network(path, ports, "float distance", *nodes, "distance = ReduceMean <keepdims = 0> (size)")
 
 
 def cached(monkeypatch: pytest.MonkeyPatch, folder: Path, **contract: tuple[str, str]) -> Path:

@@ -10,9 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper, numpy_helper
 
 import msgs_slam.pipelines.frames.learned as learned
 from msgs_slam.formats.errors import InputError
@@ -31,19 +29,11 @@ from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.sfm.matching import match_descriptors
 from msgs_slam.pipelines.types import Features
+from tests.networks import save_network
 from tests.world import ClipOptions, make_world, render_frame
 
 STEP, SIDE = 16, 128
 """The stand-in has a feature in each cell; the picture it is made for has this side after padding."""
-
-
-def constant(name: str, value: np.ndarray) -> onnx.TensorProto:
-    return numpy_helper.from_array(value, name)
-
-
-def save(path: Path, nodes: list, inputs: list, outputs: list, constants: list) -> None:
-    graph = helper.make_graph(nodes, "stand_in", inputs, outputs, constants)
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), path)
 
 
 def write_extractor(path: Path) -> None:
@@ -52,57 +42,45 @@ def write_extractor(path: Path) -> None:
     cells = SIDE // STEP
     centre = (np.arange(cells) * STEP + (STEP - 1) / 2) / (SIDE - 1) * 2 - 1
     points = np.stack(np.meshgrid(centre, centre), -1).reshape(1, -1, 2).astype(np.float32)
-    value = helper.make_tensor_value_info
-    nodes = [
-        helper.make_node("Slice", ["image", "zero", "one", "axis"], ["red"]),
-        helper.make_node("AveragePool", ["red"], ["small"], kernel_shape=[1, 2], strides=[1, 2]),
-        helper.make_node("Reshape", ["small", "rows"], ["split"]),
-        helper.make_node("Transpose", ["split"], ["cells"], perm=[0, 2, 1, 3]),
-        helper.make_node("Reshape", ["cells", "flat"], ["patches"]),
-        helper.make_node("ReduceMean", ["patches"], ["mean"], axes=[2]),
-        helper.make_node("Sub", ["patches", "mean"], ["centred"]),
-        helper.make_node("LpNormalization", ["centred"], ["descriptors"], axis=2, p=2),
-        helper.make_node("Identity", ["points"], ["keypoints"]),
-        helper.make_node("ReduceMax", ["descriptors"], ["best"], axes=[2], keepdims=0),
-        helper.make_node("Cast", ["max_keypoints"], ["limit"], to=TensorProto.FLOAT),
-        helper.make_node("Sum", ["best", "limit", "min_score"], ["scores"]),
-    ]
-    constants = [
-        constant("zero", np.array([0])), constant("one", np.array([1])), constant("axis", np.array([1])),
-        constant("rows", np.array([cells, STEP, cells, STEP // 2])), constant("flat", np.array([1, cells**2, 128])),
-        constant("points", points),
-    ]  # fmt: skip
-    inputs = [
-        value("image", TensorProto.FLOAT, [1, 3, "h", "w"]),
-        value("max_keypoints", TensorProto.INT64, []),
-        value("min_score", TensorProto.FLOAT, []),
-    ]
-    outputs = [value(n, TensorProto.FLOAT, None) for n in ("keypoints", "descriptors", "scores")]
-    save(path, nodes, inputs, outputs, constants)
+    save_network(
+        path,
+        "float[1, 3, h, w] image, int64 max_keypoints, float min_score",
+        "float[] keypoints, float[] descriptors, float[] scores",
+        "red = Slice (image, zero, one, axis)",
+        "small = AveragePool <kernel_shape = [1, 2], strides = [1, 2]> (red)",
+        "split = Reshape (small, rows)",
+        "cells = Transpose <perm = [0, 2, 1, 3]> (split)",
+        "patches = Reshape (cells, flat)",
+        "mean = ReduceMean <axes = [2]> (patches)",
+        "centred = Sub (patches, mean)",
+        "descriptors = LpNormalization <axis = 2, p = 2> (centred)",
+        "keypoints = Identity (points)",
+        "best = ReduceMax <axes = [2], keepdims = 0> (descriptors)",
+        "limit = Cast <to = 1> (max_keypoints)",
+        "scores = Sum (best, limit, min_score)",
+        zero=[0], one=[1], axis=[1], rows=[cells, STEP, cells, STEP // 2], flat=[1, cells**2, 128], points=points,
+    )  # fmt: skip
 
 
 def write_matcher(path: Path) -> None:
     """Each feature's partner is the one of the largest product, which is the score."""
-    value = helper.make_tensor_value_info
-    nodes = [
-        helper.make_node("Transpose", ["desc1"], ["turned"], perm=[0, 2, 1]),
-        helper.make_node("MatMul", ["desc0", "turned"], ["alike"]),
-        helper.make_node("ArgMax", ["alike"], ["partner"], axis=2, keepdims=0),
-        helper.make_node("ReduceMax", ["alike"], ["score"], axes=[2], keepdims=0),
-        helper.make_node("Squeeze", ["partner", "first"], ["matches0"]),
-        helper.make_node("Squeeze", ["score", "first"], ["plain"]),
-        *(helper.make_node("ReduceSum", [n], [f"sum_{n}"], keepdims=0) for n in NOT_LOOKED_AT),
-        helper.make_node("Sum", [f"sum_{n}" for n in NOT_LOOKED_AT], ["all"]),
-        helper.make_node("Mul", ["all", "nothing"], ["none"]),
-        helper.make_node("Add", ["plain", "none"], ["mscores0"]),
-    ]
-    sizes = {"kpts0": [1, "m", 2], "kpts1": [1, "n", 2], "desc0": [1, "m", 128], "desc1": [1, "n", 128]}
-    sizes |= {"image_size0": [1, 2], "image_size1": [1, 2]}
-    inputs = [value(name, TensorProto.FLOAT, shape) for name, shape in sizes.items()]
-    outputs = [value("matches0", TensorProto.INT64, None), value("mscores0", TensorProto.FLOAT, None)]
-    save(
-        path, nodes, inputs, outputs, [constant("first", np.array([0])), constant("nothing", np.float32(0).reshape(()))]
-    )
+    save_network(
+        path,
+        "float[1, m, 2] kpts0, float[1, n, 2] kpts1, float[1, m, 128] desc0, float[1, n, 128] desc1, "
+        "float[1, 2] image_size0, float[1, 2] image_size1",
+        "int64[] matches0, float[] mscores0",
+        "turned = Transpose <perm = [0, 2, 1]> (desc1)",
+        "alike = MatMul (desc0, turned)",
+        "partner = ArgMax <axis = 2, keepdims = 0> (alike)",
+        "score = ReduceMax <axes = [2], keepdims = 0> (alike)",
+        "matches0 = Squeeze (partner, first)",
+        "plain = Squeeze (score, first)",
+        *(f"sum_{n} = ReduceSum <keepdims = 0> ({n})" for n in NOT_LOOKED_AT),
+        f"all = Sum ({', '.join(f'sum_{n}' for n in NOT_LOOKED_AT)})",
+        "none = Mul (all, nothing)",
+        "mscores0 = Add (plain, none)",
+        first=[0], nothing=0.0,
+    )  # fmt: skip
 
 
 NOT_LOOKED_AT = ("kpts0", "kpts1", "image_size0", "image_size1")

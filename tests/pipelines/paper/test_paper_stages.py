@@ -6,12 +6,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import onnx
 import pytest
 import torch
 from click.testing import CliRunner
 from finished import note_finished
-from onnx import TensorProto, helper, numpy_helper
 
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.compute.threads import get_threads, set_threads
@@ -29,6 +27,7 @@ from msgs_slam.pipelines.run.files import CLASS_IDS, CLASSES, DEPTH_FIELDS, MAP,
 from msgs_slam.pipelines.run.folder import RunFolder, load_settings
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Trajectory
+from tests.networks import save_network
 from tests.pipelines.mapping.small_run import make_run
 
 CONFIG = Config(run=RunConfig(method="paper", threads=1))
@@ -200,22 +199,18 @@ def test_a_chosen_setting_that_the_paper_overrides_is_warned_of(
 def dinov2_like(folder: Path) -> Path:
     """A card of a network with DINOv2's inputs and outputs and made weights: a token of 14 x 14 pixels is their mean
     colour, and the class token that of the image."""
-    shape = numpy_helper.from_array(np.array([1, 3, -1]), "shape")
-    nodes = [
-        helper.make_node("AveragePool", ["pixel_values"], ["means"], kernel_shape=[14, 14], strides=[14, 14]),
-        helper.make_node("GlobalAveragePool", ["pixel_values"], ["mean"]),
-        helper.make_node("Reshape", ["means", "shape"], ["patches"]),
-        helper.make_node("Reshape", ["mean", "shape"], ["whole"]),
-        helper.make_node("Concat", ["whole", "patches"], ["both"], axis=2),
-        helper.make_node("Transpose", ["both"], ["last_hidden_state"], perm=[0, 2, 1]),
-    ]
-    image = helper.make_tensor_value_info("pixel_values", TensorProto.FLOAT, [1, 3, "height", "width"])
-    tokens = helper.make_tensor_value_info("last_hidden_state", TensorProto.FLOAT, [1, "tokens", 3])
-    model = helper.make_model(
-        helper.make_graph(nodes, "dinov2", [image], [tokens], [shape]), opset_imports=[helper.make_opsetid("", 17)]
+    save_network(
+        folder / "dinov2.onnx",
+        "float[1, 3, height, width] pixel_values",
+        "float[1, tokens, 3] last_hidden_state",
+        "means = AveragePool <kernel_shape = [14, 14], strides = [14, 14]> (pixel_values)",
+        "mean = GlobalAveragePool (pixel_values)",
+        "patches = Reshape (means, shape)",
+        "whole = Reshape (mean, shape)",
+        "both = Concat <axis = 2> (whole, patches)",
+        "last_hidden_state = Transpose <perm = [0, 2, 1]> (both)",
+        shape=[1, 3, -1],
     )
-    model.ir_version = 8
-    onnx.save(model, folder / "dinov2.onnx")
     (folder / "card.toml").write_text(
         'task = "segmentation"\nmodel = "dinov2.onnx"\ninput = "pixel_values"\noutput = "last_hidden_state"\n'
         'kind = "tokens"\nwhite = 1.0\nmean = [0.485, 0.456, 0.406]\nstd = [0.229, 0.224, 0.225]\nmultiple = 14\n'

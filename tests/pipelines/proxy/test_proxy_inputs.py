@@ -5,9 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper
 from proxy_room import Room, write_source
 
 from msgs_slam.formats.errors import InputError
@@ -19,6 +17,7 @@ from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
+from tests.networks import save_network
 
 
 @pytest.fixture
@@ -32,18 +31,8 @@ def settings(depth: str, semantics: str = "auto") -> Config:
 
 
 def write_network(path: Path, gain: float, x: str = "x", y: str = "y") -> None:
-    nodes = [
-        helper.make_node("ReduceMean", [x], ["m"], axes=[1], keepdims=1),
-        helper.make_node("Mul", ["m", "gain"], [y]),
-    ]
-    weight = helper.make_tensor("gain", TensorProto.FLOAT, [1], [gain])
-    graph = helper.make_graph(
-        nodes, "net",
-        [helper.make_tensor_value_info(x, TensorProto.FLOAT, [1, 3, "h", "w"])],
-        [helper.make_tensor_value_info(y, TensorProto.FLOAT, [1, 1, "h", "w"])],
-        [weight],
-    )  # fmt: skip
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
+    mean, scaled = f"m = ReduceMean <axes = [1], keepdims = 1> ({x})", f"{y} = Mul (m, gain)"
+    save_network(path, f"float[1, 3, h, w] {x}", f"float[1, 1, h, w] {y}", mean, scaled, gain=[float(gain)])
 
 
 def test_changed_files_are_seen(source: Path) -> None:

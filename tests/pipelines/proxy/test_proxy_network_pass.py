@@ -6,10 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 from numpy.typing import NDArray
-from onnx import TensorProto, helper, numpy_helper
 from proxy_room import Room
 
 from msgs_slam.pipelines.labels.learned import OnnxClusters, spherical_kmeans
@@ -19,6 +17,7 @@ from msgs_slam.pipelines.networks.network_pass import Arrays, NetworkPass, Resul
 from msgs_slam.pipelines.providers import DepthEstimate, Sequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics
+from tests.networks import color_tokens
 
 
 class Counting:
@@ -111,20 +110,7 @@ def test_a_long_pass_says_how_long(
 
 def transformer(folder: Path) -> Path:
     """A class token, then one token a patch that holds the mean colour of the patch; no head."""
-    weights = [numpy_helper.from_array(np.array([1, 3, -1]), "shape")]
-    weights += [numpy_helper.from_array(np.full((1, 1, 3), 9.0, np.float32), "class_token")]
-    nodes = [
-        helper.make_node("AveragePool", ["x"], ["pooled"], kernel_shape=[14, 14], strides=[14, 14]),
-        helper.make_node("Reshape", ["pooled", "shape"], ["flat"]),
-        helper.make_node("Transpose", ["flat"], ["patches"], perm=[0, 2, 1]),
-        helper.make_node("Concat", ["class_token", "patches"], ["tokens"], axis=1),
-    ]
-    x = helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, 3, "h", "w"])
-    y = helper.make_tensor_value_info("tokens", TensorProto.FLOAT, [1, "n", 3])
-    graph = helper.make_graph(nodes, "transformer", [x], [y], weights)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
-    model.ir_version = 8
-    onnx.save(model, folder / "net.onnx")
+    color_tokens(folder / "net.onnx")
     card = folder / "card.toml"
     card.write_text(
         'task="segmentation"\nmodel="net.onnx"\ninput="x"\noutput="tokens"\nkind="tokens"\nwhite=1.0\nmultiple=14\n'

@@ -26,6 +26,7 @@ from msgs_slam.pipelines.providers import Sequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics
 from tests.network_labels import network_labels
+from tests.networks import PICTURE, color_tokens, save_network
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 NEAREST, SPAN = 1.5, 2.0
@@ -45,42 +46,22 @@ def const(name: str, value: Any, kind: Any = np.float32) -> onnx.TensorProto:
 def stand_in(path: Path, family: str, canonical_per_metre: float) -> None:
     """A network that reads metres off the red channel (NEAREST + SPAN · red) and answers in its canonical space."""
     white, in_graph, output, axes, rule = FAMILIES[family]
-    nodes, weights = [], [const("red", 0, np.int64), const("span", SPAN * canonical_per_metre)]
-    weights += [const("nearest", NEAREST * canonical_per_metre), const("axis", [1], np.int64)]
-    if in_graph:  # normalised and back: proves that nothing was normalised before
-        weights += [const("scale", 1 / white)]
-        nodes += [helper.make_node("Mul", ["x", "scale"], ["unit"])]
-    else:
-        weights += [const("std", np.array(STD).reshape(3, 1, 1)), const("mean", np.array(MEAN).reshape(3, 1, 1))]
-        nodes += [
-            helper.make_node("Mul", ["x", "std"], ["spread"]),
-            helper.make_node("Add", ["spread", "mean"], ["unit"]),
-        ]
-    nodes += [
-        helper.make_node("Gather", ["unit", "red"], ["one"], axis=1),
-        helper.make_node("Mul", ["one", "span"], ["scaled"]),
-        helper.make_node("Add", ["scaled", "nearest"], ["depth3"]),
-        helper.make_node("Unsqueeze", ["depth3", "axis"], ["depth4"]),
-    ]
-    last = "depth4"
+    # Normalised and back: proves that nothing was normalised before.
+    nodes = ["unit = Mul (x, scale)"] if in_graph else ["spread = Mul (x, std)", "unit = Add (spread, mean)"]
+    nodes += ["one = Gather <axis = 1> (unit, red)", "scaled = Mul (one, span)", "depth3 = Add (scaled, nearest)"]
+    nodes += ["depth4 = Unsqueeze (depth3, axis)"]
     if rule == "14":  # 4 · floor(3.5 · floor(H / 14)): 518 gives 516
-        weights += [const("start", [2], np.int64), const("end", [4], np.int64), const("seven", [7], np.int64)]
-        weights += [const(n, [v], np.int64) for n, v in (("two", 2), ("four", 4), ("fourteen", 14))]
-        weights += [const("lead", [1, 1], np.int64)]
-        chain = [("Div", "hw", "fourteen", "p"), ("Mul", "p", "seven", "q"), ("Div", "q", "two", "r")]
-        nodes += [
-            helper.make_node("Shape", ["x"], ["shape"]),
-            helper.make_node("Slice", ["shape", "start", "end"], ["hw"]),
-        ]
-        nodes += [helper.make_node(op, [a, b], [c]) for op, a, b, c in [*chain, ("Mul", "r", "four", "s")]]
-        nodes += [helper.make_node("Concat", ["lead", "s"], ["sizes"], axis=0)]
-        nodes += [helper.make_node("Resize", ["depth4", "", "", "sizes"], ["resized"], mode="linear")]
-        last = "resized"
-    if axes == 3:
-        nodes += [helper.make_node("Squeeze", [last, "axis"], [output])]
-    else:
-        nodes += [helper.make_node("Identity", [last], [output])]
-    save(path, nodes, weights, output, [None] * axes)
+        nodes += ["shape = Shape (x)", "hw = Slice (shape, start, end)", "p = Div (hw, fourteen)", "q = Mul (p, seven)"]
+        nodes += ["r = Div (q, two)", "s = Mul (r, four)", "sizes = Concat <axis = 0> (lead, s)"]
+        nodes += ['resized = Resize <mode = "linear"> (depth4, , , sizes)']
+    last = "resized" if rule == "14" else "depth4"
+    nodes += [f"{output} = {'Squeeze' if axes == 3 else 'Identity'} ({last}{', axis' if axes == 3 else ''})"]
+    save_network(
+        path, PICTURE, f"float[{', '.join('abcd'[:axes])}] {output}", *nodes,
+        red=0, axis=[1], span=SPAN * canonical_per_metre, nearest=NEAREST * canonical_per_metre, scale=1 / white,
+        std=np.array(STD).reshape(3, 1, 1), mean=np.array(MEAN).reshape(3, 1, 1),
+        start=[2], end=[4], seven=[7], two=[2], four=[4], fourteen=[14], lead=[1, 1],
+    )  # fmt: skip
 
 
 def save(path: Path, nodes: list, weights: list, output: str, shape: list, x_shape: tuple = (1, 3, "H", "W")) -> None:
@@ -402,24 +383,16 @@ def test_the_point_map_family_comes_back_as_metres(tmp_path: Path) -> None:
     points = np.stack([rays_x * metres, rays_y * metres, metres], -1) / 2.5 - [0, 0, 0.3]
     mask = np.ones(metres.shape)
     mask[:, :40] = 0
-    values = {"points": points, "mask": mask}
-    weights = [const(f"{k}_value", v[None]) for k, v in values.items()] + [const("s_value", [2.5]), const("none", 0)]
-    weights += [const("sum_axes", [0, 1, 2, 3], np.int64)]
-    nodes = [helper.make_node("ReduceSum", ["x", "sum_axes"], ["sum"], keepdims=0)]
-    nodes += [helper.make_node("Cast", ["num_tokens"], ["t"], to=TensorProto.FLOAT)]
-    nodes += [helper.make_node("Add", ["sum", "t"], ["u"])]
-    nodes += [helper.make_node("Mul", ["u", "none"], ["zero"])]
-    outputs = []
-    for name, rank in (("points", 4), ("mask", 3), ("s", 1)):
-        nodes.append(helper.make_node("Add", [f"{name}_value", "zero"], [name]))
-        outputs.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, [None] * rank))
-    inputs = [helper.make_tensor_value_info("x", TensorProto.FLOAT, ["B", 3, "H", "W"])]
-    inputs += [helper.make_tensor_value_info("num_tokens", TensorProto.INT64, [])]
-    model = helper.make_model(
-        helper.make_graph(nodes, "points", inputs, outputs, weights), opset_imports=[helper.make_opsetid("", 17)]
-    )
-    model.ir_version = 8
-    onnx.save(model, tmp_path / "net.onnx")
+    save_network(
+        tmp_path / "net.onnx", f"{PICTURE}, int64 num_tokens",
+        "float[b, h, w, c] points, float[b, h, w] mask, float[k] s",
+        "sum = ReduceSum <keepdims = 0> (x)",
+        "t = Cast <to = 1> (num_tokens)",
+        "u = Add (sum, t)",
+        "zero = Mul (u, none)",
+        *(f"{name} = Add ({name}_value, zero)" for name in ("points", "mask", "s")),
+        none=0.0, points_value=points[None], mask_value=mask[None], s_value=[2.5],
+    )  # fmt: skip
     card = write_card(
         tmp_path / "c.toml", task="depth", model="net.onnx", input="x", white=1.0, multiple=14, pixels=100_000,
         output="points", kind="points", tokens="num_tokens", mask="mask", metric_scale="s",
@@ -484,14 +457,7 @@ def test_a_head_with_code_in_it_is_refused_and_not_run(tmp_path: Path, monkeypat
 
 def test_tokens_go_through_the_head_into_groups(tmp_path: Path) -> None:
     """A transformer's stand-in: a class token, then one token a patch that holds the mean colour of the patch."""
-    weights = [const("shape", [1, 3, -1], np.int64), const("class_token", np.full((1, 1, 3), 9.0))]
-    nodes = [
-        helper.make_node("AveragePool", ["x"], ["pooled"], kernel_shape=[14, 14], strides=[14, 14]),
-        helper.make_node("Reshape", ["pooled", "shape"], ["flat"]),
-        helper.make_node("Transpose", ["flat"], ["patches"], perm=[0, 2, 1]),
-        helper.make_node("Concat", ["class_token", "patches"], ["tokens"], axis=1),
-    ]
-    save(tmp_path / "net.onnx", nodes, weights, "tokens", [1, "n", 3])
+    color_tokens(tmp_path / "net.onnx")
     state = {f"decode_head.bn.{k}": v for k, v in torch.nn.BatchNorm2d(3).state_dict().items()}
     state |= {"decode_head.conv_seg.weight": 30 * torch.eye(3)[..., None, None]}
     state |= {"decode_head.conv_seg.bias": torch.zeros(3)}
@@ -528,18 +494,14 @@ def plane_network(folder: Path, camera: Intrinsics, flip: NDArray[np.float64], l
     normals[:, : camera.width // 4] = flip * [0, 1, 0]  # there the two answers contradict each other
     kappa = np.where(y < camera.height / 2, 30.0, 1.0)
     values = {"depth": depth, "n": normals.transpose(2, 0, 1) if layout == "first" else normals, "k": kappa}
-    weights = [const(f"{k}_value", v[None]) for k, v in values.items()] + [const("none", 0)]
-    nodes = [helper.make_node("ReduceSum", ["x"], ["sum"], keepdims=0)]
-    nodes += [helper.make_node("Mul", ["sum", "none"], ["zero"])]
-    nodes += [helper.make_node("Add", [f"{k}_value", "zero"], [k]) for k in values]
-    outputs = [helper.make_tensor_value_info(k, TensorProto.FLOAT, [None] * (v.ndim + 1)) for k, v in values.items()]
-    size = (1, 3, camera.height, camera.width)
-    graph = helper.make_graph(
-        nodes, "plane", [helper.make_tensor_value_info("x", TensorProto.FLOAT, size)], outputs, weights
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
-    model.ir_version = 8
-    onnx.save(model, folder / "net.onnx")
+    save_network(
+        folder / "net.onnx", f"float[1, 3, {camera.height}, {camera.width}] x",
+        "float[a, b, c] depth, float[d, e, f, g] n, float[h, i, j] k",
+        "sum = ReduceSum <keepdims = 0> (x)",
+        "zero = Mul (sum, none)",
+        *(f"{k} = Add ({k}_value, zero)" for k in values),
+        none=0.0, **{f"{k}_value": v[None] for k, v in values.items()},
+    )  # fmt: skip
     keys = {"task": "depth", "model": "net.onnx", "input": "x", "output": "depth", "normals": "n"}
     return Network(write_card(folder / "c.toml", **keys, **more), 1, "cpu")
 

@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 from click.testing import CliRunner
 from numpy.typing import NDArray
-from onnx import TensorProto, helper, numpy_helper
 from proxy_room import Room, write_source
 from tokenizers import Tokenizer, models, normalizers, pre_tokenizers
 
@@ -30,6 +28,7 @@ from msgs_slam.pipelines.proxy.stage import run
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import CLASSES, PROXY_MAPS
 from msgs_slam.pipelines.types import VOID
+from tests.networks import PICTURE, save_network
 from tests.world.room import CLASSES as ROOM_CLASSES
 
 WORDS = ("wall", "floor", "side table")
@@ -40,55 +39,33 @@ SPACE = np.linalg.qr(np.random.default_rng(0).normal(size=(LENGTH, 3)))[0].astyp
 """(LENGTH, 3) the shared space: a colour -1..1 times it, in any length, is the feature of a picture and of a text."""
 
 
-def tensor(name: str, value: Any, kind: Any = np.float32) -> onnx.TensorProto:
-    return numpy_helper.from_array(np.ascontiguousarray(value, kind), name)
-
-
-def save(path: Path, nodes: list, weights: list, inputs: list, output: str, shape: list) -> None:
-    out = helper.make_tensor_value_info(output, TensorProto.FLOAT, shape)
-    graph = helper.make_graph(nodes, "stand-in", inputs, [out], weights)
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), path)
-
-
 def write_pictures_encoder(path: Path, space: NDArray, kind: str = "features") -> None:
     """The mean colour of every 8 x 8 pixels, in the shared space and seven times as long."""
-    nodes = [
-        helper.make_node("Conv", ["x", "space"], ["fine"]),
-        helper.make_node("AveragePool", ["fine"], ["y"], kernel_shape=[8, 8], strides=[8, 8]),
-    ]
-    weights = [tensor("space", 7 * space[:, :, None, None])]
-    shape: list = [1, "f", "h", "w"]
+    mean = "fine = Conv (x, space)", "y = AveragePool <kernel_shape = [8, 8], strides = [8, 8]> (fine)"
+    weights = {"space": 7 * space[:, :, None, None], "flat": [1, len(space), -1]}
     if kind == "tokens":
-        nodes += [
-            helper.make_node("Reshape", ["y", "flat"], ["z"]),
-            helper.make_node("Transpose", ["z"], ["t"], perm=[0, 2, 1]),
-        ]
-        weights, shape = [*weights, tensor("flat", [1, len(space), -1], np.int64)], [1, "n", "f"]
-    x = helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, 3, "H", "W"])
-    save(path, nodes, weights, [x], "y" if kind == "features" else "t", shape)
+        turned = "z = Reshape (y, flat)", "t = Transpose <perm = [0, 2, 1]> (z)"
+        save_network(path, PICTURE, "float[1, n, f] t", *mean, *turned, **weights)
+    else:
+        save_network(path, PICTURE, "float[1, f, h, w] y", *mean, **weights)
 
 
 def write_text_encoder(folder: Path, tokens: int | None = None) -> None:
     """The sum over the tokens of a text, each times its place's share: other words for "a photo of a" say nothing."""
     vocabulary = ["[UNK]", "a", "photo", "of", ".", *COLOURS, *BACKGROUND]
     rows = [np.zeros(3)] * 5 + [3.0 * np.array(c) for c in (COLOURS | BACKGROUND).values()]
-    nodes = [
-        helper.make_node("Gather", ["table", "input_ids"], ["each"]),
-        helper.make_node("Cast", ["attention_mask"], ["use"], to=TensorProto.FLOAT),
-        helper.make_node("Unsqueeze", ["use", "last"], ["column"]),
-        helper.make_node("Mul", ["each", "column"], ["said"]),
-        helper.make_node("ReduceSum", ["said", "middle"], ["text_embeds"], keepdims=0),
-    ]
-    weights = [
-        tensor("table", np.array(rows) @ SPACE.T),
-        tensor("last", [2], np.int64),
-        tensor("middle", [1], np.int64),
-    ]
-    inputs = [
-        helper.make_tensor_value_info(name, TensorProto.INT64, ["batch", tokens or "sequence"])
-        for name in ("input_ids", "attention_mask")
-    ]
-    save(folder / "text.onnx", nodes, weights, inputs, "text_embeds", ["batch", LENGTH])
+    length = tokens or "sequence"
+    save_network(
+        folder / "text.onnx",
+        f"int64[batch, {length}] input_ids, int64[batch, {length}] attention_mask",
+        f"float[batch, {LENGTH}] text_embeds",
+        "each = Gather (table, input_ids)",
+        "use = Cast <to = 1> (attention_mask)",
+        "column = Unsqueeze (use, last)",
+        "said = Mul (each, column)",
+        "text_embeds = ReduceSum <keepdims = 0> (said, middle)",
+        table=np.array(rows) @ SPACE.T, last=[2], middle=[1],
+    )  # fmt: skip
     tokenizer = Tokenizer(models.WordLevel({word: i for i, word in enumerate(vocabulary)}, "[UNK]"))
     tokenizer.normalizer, tokenizer.pre_tokenizer = normalizers.Lowercase(), pre_tokenizers.Whitespace()
     tokenizer.save(str(folder / "tokenizer.json"))

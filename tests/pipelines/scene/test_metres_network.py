@@ -5,9 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper, numpy_helper
 
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.networks.card import Card
@@ -15,6 +13,7 @@ from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.scene.network import SMALL_SD, network_scale, retake
 from msgs_slam.pipelines.scene.view import SeenFrame
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
+from tests.networks import save_network
 
 SIDE, NEAREST, SPAN = 64, 1.0, 3.0
 CAMERA = Intrinsics(200, 150, 160.0, 160.0, 104.0, 72.0)
@@ -22,21 +21,15 @@ CAMERA = Intrinsics(200, 150, 160.0, 160.0, 104.0, 72.0)
 
 def stand_in(path: Path) -> Card:
     """Metres = 1 + 3 · red, for pictures of its own 64 x 64 camera."""
-    weights = [
-        numpy_helper.from_array(np.array(v, t), n)
-        for n, v, t in (("red", [0], np.int64), ("span", SPAN, np.float32), ("near", NEAREST, np.float32))
-    ]
-    nodes = [
-        helper.make_node("Gather", ["image", "red"], ["one"], axis=1),
-        helper.make_node("Mul", ["one", "span"], ["scaled"]),
-        helper.make_node("Add", ["scaled", "near"], ["depth"]),
-    ]
-    picture, plane = (
-        helper.make_tensor_value_info(n, TensorProto.FLOAT, [1, c, SIDE, SIDE]) for n, c in (("image", 3), ("depth", 1))
-    )
-    graph = helper.make_graph(nodes, "stand-in", [picture], [plane], weights)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    onnx.save(model, path)
+    save_network(
+        path,
+        f"float[1, 3, {SIDE}, {SIDE}] image",
+        f"float[1, 1, {SIDE}, {SIDE}] depth",
+        "one = Gather <axis = 1> (image, red)",
+        "scaled = Mul (one, span)",
+        "depth = Add (scaled, near)",
+        red=[0], span=float(SPAN), near=float(NEAREST),
+    )  # fmt: skip
     return Card("depth", path, "image", "depth", white=1.0, size=(SIDE, SIDE), focal=(60.0, 80.0), relative="scale")
 
 
