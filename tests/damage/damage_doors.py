@@ -20,7 +20,6 @@ import torch
 from damage_mutate import Mutator, in_json, in_ply, in_text, in_zip, with_json_head
 from layouts import LAYOUTS
 from PIL import Image
-from scipy.spatial.transform import Rotation
 from tiny_tflite import write_tflite
 from tokenizers import Tokenizer, normalizers, pre_tokenizers, trainers
 from tokenizers import models as tokenizer_models
@@ -66,8 +65,9 @@ from msgs_slam.pipelines.networks.words import load_linear_head, load_word_head,
 from msgs_slam.pipelines.source.given import read_intrinsics
 from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.viewer.scene import load_scenes
+from tests.clouds import random_cloud
 from tests.colmap_models import posed_images
-from tests.matrices import write_matrices
+from tests.matrices import random_poses, write_matrices
 from tests.networks import save_network
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 4
@@ -285,21 +285,9 @@ def _rng() -> np.random.Generator:
     return np.random.default_rng(1)
 
 
-def _poses() -> np.ndarray:
-    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
-    poses[:, :3, :3] = Rotation.random(FRAMES, rng=np.random.default_rng(2)).as_matrix()
-    poses[:, :3, 3] = _rng().normal(size=(FRAMES, 3))
-    return poses
-
-
 def _cloud() -> GaussianCloud:
-    g = np.random.default_rng(3)
-    quat, probs = g.normal(size=(20, 4)), g.random((20, 3)).astype(np.float32)
-    return GaussianCloud(
-        g.normal(size=(20, 3)).astype(np.float32), (g.normal(size=(20, 3)) - 3).astype(np.float32),
-        (quat / np.linalg.norm(quat, axis=1, keepdims=True)).astype(np.float32), g.normal(size=20).astype(np.float32),
-        g.random((20, 3)).astype(np.float32), probs.argmax(1).astype(np.uint8), probs / probs.sum(1, keepdims=True),
-    )  # fmt: skip
+    probs = np.random.default_rng(3).dirichlet(np.ones(3), 20).astype(np.float32)
+    return replace(random_cloud(20), class_ids=probs.argmax(1).astype(np.uint8), class_probs=probs)
 
 
 def _mesh() -> MeshBlocks:
@@ -319,7 +307,7 @@ def make_colmap(suffix: str) -> Callable[[Path], None]:
         image, point = np.repeat(np.arange(FRAMES), points), np.tile(np.arange(points), FRAMES)
         xyz, rgb = _rng().normal(size=(points, 3)), _rng().integers(0, 255, (points, 3)).astype(np.uint8)
         xy = _rng().random((FRAMES * points, 2)) * 48
-        model = posed_images(names, _poses(), WIDTH, HEIGHT, 50.0, 51.0, 32.0, 24.0)
+        model = posed_images(names, random_poses(FRAMES, 2), WIDTH, HEIGHT, 50.0, 51.0, 32.0, 24.0)
         seen = {"points": xyz, "colors": rgb, "obs_image": image, "obs_point": point, "obs_xy": xy}
         write_colmap_model(folder, replace(model, **seen))
         for other in (p for p in folder.iterdir() if p.suffix != suffix):
@@ -353,7 +341,7 @@ def make_truth(folder: Path) -> None:
         write_grey_png(folder / "labels" / f"{i:06d}.png", (raw % 3).astype(np.uint8))
     write_json(folder / "classes.json", {"classes": [{"id": i, "name": f"c{i}"} for i in range(3)]})
     make_intrinsics(folder)
-    write_matrices(folder / "traj.txt", _poses())
+    write_matrices(folder / "traj.txt", random_poses(FRAMES, 2))
     (folder / "timestamps.txt").write_text("".join(f"{i * 0.1}\n" for i in range(FRAMES)))
 
 
@@ -481,10 +469,10 @@ DOORS: dict[str, Door] = {
         load_tensors, "a.safetensors", JSON_HEAD,
     ),
     "TUM trajectory": Door(
-        lambda f: write_tum(f / "a.txt", np.arange(float(FRAMES)), _poses()), tum, "a.txt"
+        lambda f: write_tum(f / "a.txt", np.arange(float(FRAMES)), random_poses(FRAMES, 2)), tum, "a.txt"
     ),
     "matrices": Door(
-        lambda f: write_matrices(f / "a.txt", _poses()), lambda p: judge_poses(read_matrices(p)), "a.txt"
+        lambda f: write_matrices(f / "a.txt", random_poses(FRAMES, 2)), lambda p: judge_poses(read_matrices(p)), "a.txt"
     ),
     **{
         f"picture {name.split('.')[1]}": Door(make_picture(name), picture, name)

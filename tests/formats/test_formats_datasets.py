@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.datasets import VOID_LABEL, Camera, Sequence, open_sequence, recognise
 from msgs_slam.formats.datasets.matching import poses_at
@@ -15,7 +14,7 @@ from msgs_slam.formats.datasets.sequence import warp_nearest
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
 from msgs_slam.formats.trajectory import write_tum
-from tests.matrices import write_matrices
+from tests.matrices import random_poses, write_matrices
 
 
 def _depth_disagreement(sequence: Sequence, i: int, j: int) -> float:
@@ -113,14 +112,6 @@ def test_a_folder_of_photos_is_a_sequence_without_truth(shared_data: Path) -> No
     assert sequence.names[0] == "frame_0001.jpg"
 
 
-def _random_poses(n: int) -> np.ndarray:
-    rng = np.random.default_rng(3)
-    poses = np.tile(np.eye(4), (n, 1, 1))
-    poses[:, :3, :3] = Rotation.random(n, rng=rng).as_matrix()
-    poses[:, :3, 3] = rng.normal(size=(n, 3))
-    return poses
-
-
 def _write_images(folder: Path, names: list[str], size: tuple[int, int] = (24, 18)) -> None:
     for i, name in enumerate(names):
         write_rgb(folder / name, np.full((size[1], size[0], 3), 10 * i, np.uint8))
@@ -135,13 +126,13 @@ def test_nice_slam_layout(tmp_path: Path) -> None:
     path = tmp_path / "room0"
     _write_images(path / "results", [f"frame{i:06d}.jpg" for i in range(12)])
     _write_depth(path / "results", [f"depth{i:06d}.png" for i in range(12)])
-    write_matrices(path / "traj.txt", _random_poses(12))
+    write_matrices(path / "traj.txt", random_poses(12))
     camera = {"w": 24, "h": 18, "fx": 12.0, "fy": 12.0, "cx": 11.5, "cy": 8.5, "scale": 6553.5}
     (tmp_path / "cam_params.json").write_text(json.dumps({"camera": camera}))
     sequence = open_sequence(path)
     assert (sequence.format, len(sequence)) == ("replica", 12)
     assert sequence.camera == Camera(24, 18, 12.0, 12.0, 12.0, 9.0)
-    np.testing.assert_allclose(sequence.world_from_cam, _random_poses(12), atol=1e-12)
+    np.testing.assert_allclose(sequence.world_from_cam, random_poses(12), atol=1e-12)
     depth = sequence.depth(10)
     assert depth is not None
     assert depth[0, 0] == pytest.approx(11000 / 6553.5)
@@ -162,7 +153,7 @@ def test_semantic_nerf_layout(tmp_path: Path) -> None:
         else:
             for i, name in enumerate(names):
                 write_grey_png(path / folder / name, np.full((24, 32), [0, 93, 40][i % 3], np.uint8))
-    write_matrices(path / "traj_w_c.txt", _random_poses(12))
+    write_matrices(path / "traj_w_c.txt", random_poses(12))
     sequence = open_sequence(tmp_path / "room_0")
     assert sequence.names[:3] == ("rgb_0.png", "rgb_1.png", "rgb_2.png")
     assert sequence.names[-1] == "rgb_11.png"
@@ -175,7 +166,7 @@ def test_semantic_nerf_layout(tmp_path: Path) -> None:
 
 
 def test_seven_scenes_gaps_and_lost_poses(tmp_path: Path) -> None:
-    poses = _random_poses(4)
+    poses = random_poses(4)
     for row, i in enumerate((0, 5, 6, 9)):
         _write_images(tmp_path, [f"frame-{i:06d}.color.png"], (640, 480))
         if i != 5:
@@ -193,11 +184,11 @@ def test_seven_scenes_gaps_and_lost_poses(tmp_path: Path) -> None:
 def test_generic_folder_with_tum_trajectory(tmp_path: Path) -> None:
     _write_images(tmp_path / "images", ["a1.png", "a2.png", "a10.png"])
     (tmp_path / "timestamps.txt").write_text("1.0\n1.5\n2.0\n")
-    write_tum(tmp_path / "groundtruth.txt", np.array([2.001, 0.999, 1.7]), _random_poses(3))
+    write_tum(tmp_path / "groundtruth.txt", np.array([2.001, 0.999, 1.7]), random_poses(3))
     sequence = open_sequence(tmp_path)
     assert sequence.world_from_cam is not None
     assert sequence.has_pose.tolist() == [True, False, True]
-    np.testing.assert_allclose(sequence.world_from_cam[[0, 2]], _random_poses(3)[[1, 0]], atol=1e-8)
+    np.testing.assert_allclose(sequence.world_from_cam[[0, 2]], random_poses(3)[[1, 0]], atol=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -264,7 +255,7 @@ def test_unknown_formats_and_places(tmp_path: Path) -> None:
 
 
 def test_poses_at_takes_the_nearest_within_tolerance() -> None:
-    poses = _random_poses(3)
+    poses = random_poses(3)
     found = poses_at(np.array([0.0, 0.9, 5.0]), np.array([1.0, 0.0, 2.0]), poses, 0.2)
     np.testing.assert_allclose(found[:2], poses[[1, 0]])
     assert np.isnan(found[2]).all()

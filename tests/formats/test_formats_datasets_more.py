@@ -18,7 +18,7 @@ from msgs_slam.formats.datasets.colmap import camera_from_colmap
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
 from tests.colmap_models import posed_images
-from tests.matrices import write_matrices
+from tests.matrices import random_poses, write_matrices
 
 WIDTH, HEIGHT, N = 64, 48, 5
 
@@ -35,14 +35,10 @@ class Known:
 
 @pytest.fixture(scope="module")
 def known() -> Known:
-    rng = np.random.default_rng(7)
-    poses = np.tile(np.eye(4), (N, 1, 1))
-    poses[:, :3, :3] = Rotation.random(N, rng=rng).as_matrix()
-    poses[:, :3, 3] = rng.normal(size=(N, 3))
     return Known(
         [np.full((HEIGHT, WIDTH, 3), (40 * i, 20, 200 - 40 * i), np.uint8) for i in range(N)],
         [np.full((HEIGHT, WIDTH), 1 + 0.5 * i) for i in range(N)],
-        poses,
+        random_poses(N, 7),
         1305031102.1 + np.arange(N) * 0.0333,
     )
 

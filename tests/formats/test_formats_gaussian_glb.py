@@ -12,7 +12,6 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussians import GaussianCloud
 from msgs_slam.formats.splats import (
     COMPRESSION,
     EXTENSION,
@@ -21,22 +20,11 @@ from msgs_slam.formats.splats import (
     write_compressed_glb,
     write_gaussian_glb,
 )
-
-
-def _cloud(m: int = 301) -> GaussianCloud:
-    rng = np.random.default_rng(3)
-    return GaussianCloud(
-        means=rng.uniform(-5, 5, (m, 3)).astype(np.float32),
-        log_scales=rng.uniform(-8, 1, (m, 3)).astype(np.float32),
-        quat_wxyz=Rotation.random(m, rng=rng).as_quat()[:, [3, 0, 1, 2]].astype(np.float32),
-        opacity_logits=rng.uniform(-6, 6, m).astype(np.float32),
-        colors=rng.uniform(-0.1, 1.1, (m, 3)).astype(np.float32),
-        class_ids=rng.integers(0, 4, m).astype(np.uint8),
-    )
+from tests.clouds import random_cloud
 
 
 def test_round_trip_in_numbers(tmp_path: Path) -> None:
-    cloud = _cloud()
+    cloud = random_cloud()
     write_gaussian_glb(tmp_path / "a.glb", cloud, ("floor", "wall"))
     write_gaussian_glb(tmp_path / "b.glb", cloud, ("floor", "wall"))
     assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
@@ -52,7 +40,7 @@ def test_round_trip_in_numbers(tmp_path: Path) -> None:
 
 
 def test_another_reader_finds_what_the_extension_says(tmp_path: Path) -> None:
-    cloud = _cloud()
+    cloud = random_cloud()
     write_gaussian_glb(tmp_path / "map.glb", cloud, ("floor",))
     gltf = pygltflib.GLTF2().load(str(tmp_path / "map.glb"))
     assert gltf.extensionsUsed == [EXTENSION, "KHR_materials_unlit"]
@@ -83,7 +71,7 @@ def test_another_reader_finds_what_the_extension_says(tmp_path: Path) -> None:
 
 
 def test_who_does_not_know_the_extension_sees_points(tmp_path: Path) -> None:
-    cloud = _cloud()
+    cloud = random_cloud()
     write_gaussian_glb(tmp_path / "map.glb", cloud)
     points = next(iter(trimesh.load_scene(tmp_path / "map.glb").geometry.values()))
     np.testing.assert_allclose(points.vertices, cloud.means * (1, -1, -1), atol=1e-6)
@@ -93,7 +81,7 @@ def test_who_does_not_know_the_extension_sees_points(tmp_path: Path) -> None:
 
 
 def test_compressed_is_a_tenth_and_read_again(tmp_path: Path) -> None:
-    cloud = _cloud()
+    cloud = random_cloud()
     write_compressed_glb(tmp_path / "small.glb", cloud)
     read = read_gaussians(tmp_path / "small.glb")
     assert 0 < np.abs(read.means - cloud.means).max() < 1e-5
@@ -110,11 +98,11 @@ def test_compressed_is_a_tenth_and_read_again(tmp_path: Path) -> None:
 
 def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="empty"):
-        write_gaussian_glb(tmp_path / "none.glb", replace(_cloud(0), class_ids=None))
+        write_gaussian_glb(tmp_path / "none.glb", replace(random_cloud(0), class_ids=None))
     trimesh.creation.box().export(tmp_path / "box.glb")
     with pytest.raises(InputError, match="no Gaussians"):
         read_gaussian_glb(tmp_path / "box.glb")
-    write_gaussian_glb(tmp_path / "map.glb", _cloud())
+    write_gaussian_glb(tmp_path / "map.glb", random_cloud())
     data = (tmp_path / "map.glb").read_bytes()
     (tmp_path / "cut.glb").write_bytes(data[: len(data) // 2])
     length = struct.unpack_from("<I", data, 12)[0]

@@ -10,21 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from msgs_slam.formats.gaussians import GaussianCloud, unit_quaternions
 from msgs_slam.formats.sog import write_sog
+from tests.clouds import random_cloud
 
 SH_C0 = 0.28209479177387814
-
-
-def _cloud(count: int) -> GaussianCloud:
-    rng = np.random.default_rng(0)
-    return GaussianCloud(
-        rng.normal(0, 3, (count, 3)).astype(np.float32),
-        rng.normal(-4, 1, (count, 3)).astype(np.float32),
-        unit_quaternions(rng.normal(size=(count, 4))),
-        rng.normal(0, 3, count).astype(np.float32),
-        rng.uniform(-0.1, 1.1, (count, 3)).astype(np.float32),
-    )
 
 
 def _unpacked(path: Path) -> tuple[dict, dict[str, NDArray[np.float64]]]:
@@ -55,7 +44,7 @@ def _unpacked(path: Path) -> tuple[dict, dict[str, NDArray[np.float64]]]:
 
 @pytest.mark.parametrize("count", [1, 17, 3000])
 def test_a_cloud_is_what_was_written(tmp_path: Path, count: int) -> None:
-    cloud = _cloud(count)
+    cloud = random_cloud(count)
     write_sog(tmp_path / "a.sog", cloud)
     meta, found = _unpacked(tmp_path / "a.sog")
     assert (meta["version"], meta["count"]) == (2, count)
@@ -71,7 +60,7 @@ def test_a_cloud_is_what_was_written(tmp_path: Path, count: int) -> None:
 
 def test_the_same_cloud_gives_the_same_bytes_and_none_is_refused(tmp_path: Path) -> None:
     for name in ("a.sog", "b.sog"):
-        write_sog(tmp_path / name, _cloud(100))
+        write_sog(tmp_path / name, random_cloud(100))
     assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
     with pytest.raises(ValueError, match="without Gaussians"):
-        write_sog(tmp_path / "c.sog", _cloud(0))
+        write_sog(tmp_path / "c.sog", random_cloud(0))

@@ -16,18 +16,8 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.ply import read_gaussian_ply, write_gaussian_ply
 from msgs_slam.formats.splats import read_gaussians, read_splat
 from msgs_slam.formats.spz import read_spz, write_spz
-
-
-def _cloud(m: int = 500, extent: float = 5.0) -> GaussianCloud:
-    rng = np.random.default_rng(2)
-    quat_xyzw = Rotation.random(m, rng=rng).as_quat() if m else np.zeros((0, 4))
-    return GaussianCloud(
-        means=rng.uniform(-extent, extent, (m, 3)).astype(np.float32),
-        log_scales=rng.uniform(-8, 1, (m, 3)).astype(np.float32),
-        quat_wxyz=quat_xyzw[:, [3, 0, 1, 2]].astype(np.float32),
-        opacity_logits=rng.uniform(-4, 4, m).astype(np.float32),
-        colors=rng.uniform(0, 1, (m, 3)).astype(np.float32),
-    )
+from tests.clouds import random_cloud
+from tests.matrices import random_poses
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
@@ -40,7 +30,7 @@ def _rotations(cloud: GaussianCloud) -> np.ndarray:
 
 @pytest.mark.parametrize(("extent", "version"), [(0.01, 4), (5.0, 2), (5.0, 3), (5.0, 4), (3000.0, 4)])
 def test_spz_round_trip_within_its_steps(tmp_path: Path, extent: float, version: int) -> None:
-    cloud = _cloud(extent=extent)
+    cloud = random_cloud(extent=extent)
     write_spz(tmp_path / "a.spz", cloud, version)
     write_spz(tmp_path / "b.spz", cloud, version)
     assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
@@ -69,7 +59,7 @@ def test_three_programs_agree_on_the_same_gaussians(shared_data: Path) -> None:
 
 
 def test_every_kind_is_read_by_its_suffix(tmp_path: Path) -> None:
-    cloud = _cloud(7)
+    cloud = random_cloud(7)
     write_gaussian_ply(tmp_path / "c.ply", cloud)
     write_spz(tmp_path / "c.spz", cloud)
     for name in ("c.ply", "c.spz"):
@@ -77,13 +67,13 @@ def test_every_kind_is_read_by_its_suffix(tmp_path: Path) -> None:
     (tmp_path / "c.obj").touch()
     with pytest.raises(InputError, match="unsupported extension"):
         read_gaussians(tmp_path / "c.obj")
-    write_spz(tmp_path / "none.spz", _cloud(0))
+    write_spz(tmp_path / "none.spz", random_cloud(0))
     assert len(read_spz(tmp_path / "none.spz")) == 0
 
 
 def test_damaged_splats_are_explained(tmp_path: Path, shared_data: Path) -> None:
-    write_spz(tmp_path / "whole.spz", _cloud(), version=3)
-    write_spz(tmp_path / "newer.spz", _cloud())
+    write_spz(tmp_path / "whole.spz", random_cloud(), version=3)
+    write_spz(tmp_path / "newer.spz", random_cloud())
     data, newer = (tmp_path / "whole.spz").read_bytes(), (tmp_path / "newer.spz").read_bytes()
     raw = gzip.decompress(data)
     for damaged in (
@@ -91,7 +81,7 @@ def test_damaged_splats_are_explained(tmp_path: Path, shared_data: Path) -> None
         newer[:-30],
         newer[:4] + b"\x05" + newer[5:],
         newer[:8] + b"\xff\xff\xff\x7f" + newer[12:],
-        newer[:8] + struct.pack("<I", len(_cloud()) + 1) + newer[12:],
+        newer[:8] + struct.pack("<I", len(random_cloud()) + 1) + newer[12:],
         newer[:16] + b"\xff\xff\xff\x7f" + newer[20:],
         newer[:112] + bytes(8) + newer[120:],
         b"",
@@ -111,7 +101,7 @@ def test_damaged_splats_are_explained(tmp_path: Path, shared_data: Path) -> None
     (tmp_path / "nan.splat").write_bytes(b"\xff" * 64)
     with pytest.raises(InputError, match="not finite"):
         read_splat(tmp_path / "nan.splat")
-    far = _cloud(2)
+    far = random_cloud(2)
     far.means[0, 0] = 1e9
     with pytest.raises(ValueError, match="below 4 million"):
         write_spz(tmp_path / "far.spz", far)
@@ -120,10 +110,7 @@ def test_damaged_splats_are_explained(tmp_path: Path, shared_data: Path) -> None
 
 
 def test_transforms_come_back_through_the_data_set_reader(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[:, :3, :3] = Rotation.random(3, rng=rng).as_matrix()
-    poses[:, :3, 3] = rng.normal(size=(3, 3))
+    poses = random_poses(3)
     names = [f"frames/{i}.png" for i in range(3)]
     for name in names:
         write_rgb(tmp_path / name, np.zeros((6, 8, 3), np.uint8))

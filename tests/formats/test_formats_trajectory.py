@@ -11,19 +11,11 @@ from scipy.spatial.transform import Rotation
 from msgs_slam.formats.datasets.matching import poses_at
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.trajectory import nearest_rotation, read_matrices, read_tum, write_tum
-from tests.matrices import write_matrices
-
-
-def _random_poses(n: int, seed: int = 0) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    poses = np.tile(np.eye(4), (n, 1, 1))
-    poses[:, :3, :3] = Rotation.random(n, rng=rng).as_matrix()
-    poses[:, :3, 3] = rng.normal(0, 3, (n, 3))
-    return poses
+from tests.matrices import random_poses, write_matrices
 
 
 def test_tum_round_trip(tmp_path: Path) -> None:
-    poses, times = _random_poses(50), np.cumsum(np.random.default_rng(1).uniform(0.01, 1, 50)) + 1.3e9
+    poses, times = random_poses(50), np.cumsum(np.random.default_rng(1).uniform(0.01, 1, 50)) + 1.3e9
     write_tum(tmp_path / "t.txt", times, poses)
     times_back, poses_back = read_tum(tmp_path / "t.txt")
     np.testing.assert_allclose(times_back, times, rtol=0, atol=1e-6)
@@ -84,7 +76,7 @@ def test_text_of_other_systems_and_lost_rows_are_no_damage(tmp_path: Path, encod
 
 
 def test_matrix_layouts_agree(tmp_path: Path) -> None:
-    poses = _random_poses(5)
+    poses = random_poses(5)
     write_matrices(tmp_path / "16.txt", poses)
     np.savetxt(tmp_path / "12.txt", poses[:, :3].reshape(5, 12), fmt="%.17g")
     np.savetxt(tmp_path / "4.txt", poses.reshape(20, 4), fmt="%.17g", delimiter=",")
@@ -93,7 +85,7 @@ def test_matrix_layouts_agree(tmp_path: Path) -> None:
 
 
 def test_frames_without_a_pose_are_nan(tmp_path: Path) -> None:
-    poses = _random_poses(3)
+    poses = random_poses(3)
     lost = poses.copy()
     lost[1] = -np.inf
     write_matrices(tmp_path / "m.txt", lost)
@@ -104,7 +96,7 @@ def test_frames_without_a_pose_are_nan(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("spoil", ["scale", "mirror", "transpose", "zero"])
 def test_what_is_no_pose_is_refused(tmp_path: Path, spoil: str) -> None:
-    poses = _random_poses(3)
+    poses = random_poses(3)
     if spoil == "scale":
         poses[1, :3, :3] *= 1.2
     elif spoil == "mirror":

@@ -4,18 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.trajectory import read_tum
 from msgs_slam.pipelines.evaluation.truth import absolute_error, associate, relative_error
-
-
-def random_poses(count: int, rng: np.random.Generator) -> NDArray:
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = Rotation.random(count, rng).as_matrix()
-    poses[:, :3, 3] = rng.normal(size=(count, 3))
-    return poses
+from tests.matrices import random_poses
 
 
 @pytest.mark.parametrize(
@@ -44,7 +37,7 @@ def test_same_as_evo_on_random_trajectories(with_scale: bool) -> None:
     from evo.core.trajectory import PosePath3D
 
     rng = np.random.default_rng(3)
-    truth = random_poses(40, rng)
+    truth = random_poses(40, 3)
     estimate = truth.copy()
     estimate[:, :3, 3] = 0.4 * estimate[:, :3, 3] + rng.normal(scale=0.05, size=(40, 3))
     estimate[:, :3, :3] = estimate[:, :3, :3] @ Rotation.from_rotvec(rng.normal(scale=0.05, size=(40, 3))).as_matrix()
@@ -82,8 +75,7 @@ def test_noise_of_known_size_is_found_again_and_a_similarity_is_forgiven() -> No
 
 
 def test_relative_error_of_a_known_drift() -> None:
-    rng = np.random.default_rng(1)
-    truth = random_poses(30, rng)
+    truth = random_poses(30, 1)
     slip = np.eye(4)
     slip[:3, :3] = Rotation.from_rotvec((0, 0.01, 0)).as_matrix()
     slip[:3, 3] = (0.003, 0, 0.004)

@@ -27,27 +27,11 @@ from msgs_slam.pipelines.source.opening import source_digest
 from msgs_slam.pipelines.system.memory import windows_of
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration
+from tests.killed import KillAt, Killed
 from tests.pipelines.frames.conftest import QUICK, WALK_FRAMES, Walk, render, sideways, turn, write_walk
 from tests.pipelines.travelling import Travelling
 
 T = TypeVar("T")
-
-
-class Killed(Exception):
-    """Stands for the end of the process."""
-
-
-class KillAt(SilentProgress):
-    """Ends the work when the n-th item of a bar has been handed out."""
-
-    def __init__(self, label: str, item: int) -> None:
-        self._label, self._item = label, item
-
-    def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
-        for i, item in enumerate(items):
-            if label == self._label and i == self._item:
-                raise Killed
-            yield item
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -153,7 +137,7 @@ def test_a_stage_killed_again_and_again_ends_with_the_same_bytes(
     ]
     for label, item in places:
         with pytest.raises(Killed):
-            run(make_context(bent_walk.folder, progress=KillAt(label, item)))
+            run(make_context(bent_walk.folder, progress=KillAt(item, label)))
     again = make_context(bent_walk.folder)
     extracted = {p.name: p.stat().st_mtime_ns for p in (again.snapshot / "features").iterdir()}
     assert run(again) == finished[1]

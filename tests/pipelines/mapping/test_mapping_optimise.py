@@ -21,6 +21,7 @@ from msgs_slam.pipelines.mapping.seeding import SEED_LOGIT
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View
 from msgs_slam.pipelines.types import VOID
+from tests.killed import KillAt, Killed
 
 SETTINGS = MappingConfig(passes=6.0, min_iterations=0, snapshot_every=20, seed_stride=1)
 
@@ -144,23 +145,6 @@ def test_views_that_are_looked_at_side_by_side_say_the_same(
         assert all(torch.equal(a, b) for a, b in zip(alone, looked(), strict=True))
     finally:
         set_threads(before)
-
-
-class Killed(Exception):
-    """Stands for the end of the process."""
-
-
-class KillAt:
-    """A progress bar that ends the process at its n-th item."""
-
-    def __init__(self, at: int) -> None:
-        self.at = at
-
-    def track(self, items, label, total=None):
-        for n, item in enumerate(items):
-            if n == self.at:
-                raise Killed
-            yield item
 
 
 @pytest.mark.parametrize("at", [9, 75])

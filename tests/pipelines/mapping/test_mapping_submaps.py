@@ -30,6 +30,7 @@ from msgs_slam.pipelines.run.schema import RunFile
 from msgs_slam.pipelines.system.memory import MIN_SUBMAP, submap_size
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Intrinsics
+from tests.killed import Killed
 
 CONFIG = Config(
     run=RunConfig(device="cpu"),
@@ -101,10 +102,6 @@ def test_the_nearest_view_that_sees_a_place_has_it() -> None:
     on_wall, behind, outside, before = [0, 0, 4.0], [0, 0, 4.5], [9, 0, 4.0], [0, 0, 1.0]
     points = np.array([on_wall, behind, outside, before], float)
     assert nearest_seeing(points, [far, near, beside_wall]).tolist() == [1, -1, -1, 0]
-
-
-class Killed(Exception):
-    """As a killed process would end."""
 
 
 class KillAfter(SilentProgress):

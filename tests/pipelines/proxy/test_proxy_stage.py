@@ -1,6 +1,6 @@
 """The stage from frames to maps: contents, resuming, and what it says of itself."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from msgs_slam.pipelines.providers import DepthEstimate, LabelEstimate
 from msgs_slam.pipelines.proxy.stage import run
 from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, DESCRIPTORS, PROXY_MAPS
 from msgs_slam.pipelines.types import VOID, Frame
+from tests.killed import KillAt, Killed
 
 Make = Callable[..., StageContext]
 FILES = ("proxy.depth=files", "proxy.semantics=files")
@@ -88,23 +89,6 @@ def test_depth_that_is_mostly_filled_in_is_said_to_be(make_context: Make, planes
     assert bool(said) == is_warned
 
 
-class Killed(Exception):
-    """Stands for SIGKILL."""
-
-
-class Stops:
-    """A progress that is killed at the `after`-th item of the bar `label`."""
-
-    def __init__(self, label: str, after: int) -> None:
-        self._label, self._after = label, after
-
-    def track(self, items: Iterable[Any], label: str, total: int | None = None) -> Iterator[Any]:
-        for i, item in enumerate(items):
-            if label == self._label and i == self._after:
-                raise Killed
-            yield item
-
-
 def something_moved(_: Any, view: Callable[[int], MovingView], *more: Any) -> dict[int, np.ndarray]:
     """In the upper half of one keyframe."""
     moved = np.zeros(view(2).depth.shape, np.bool_)
@@ -120,7 +104,7 @@ def test_killed_in_each_pass_and_with_other_threads_it_ends_with_the_same_bytes(
     run(whole)
     broken = make_context(*EMBEDDED, "run.threads=1", name="broken")
     for label, after in (("stereo", 4), ("depth", 5), ("regions", 3), ("classes", 6)):
-        object.__setattr__(broken, "progress", Stops(label, after))
+        object.__setattr__(broken, "progress", KillAt(after, label))
         with pytest.raises(Killed):
             run(broken)
     maps = sorted((broken.folder / "maps").iterdir())
