@@ -12,15 +12,12 @@ from typing import IO, Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
-from pillow_heif import register_heif_opener
+from PIL import ExifTags, Image, UnidentifiedImageError
 
 from .atomic import write_bytes
 from .errors import InputError
 from .exif import ANTICLOCKWISE, QUARTER_TURNS, TURNS, ExifLens, lens_of, place_of
 from .reading import opened, parsing, read_bytes
-
-register_heif_opener()
 
 MAX_IMAGE_PIXELS = 120_000_000
 """A larger image is refused by its header, before memory is spent on it (phones go to 108 million)."""
@@ -299,6 +296,9 @@ def _opened(path: Path) -> Iterator[Image.Image]:
 
 
 def _quiet_open(file: IO[bytes]) -> Image.Image:
+    from pillow_heif import register_heif_opener  # takes as long to import as all the rest of a command that opens none
+
+    register_heif_opener()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit follows
         try:
@@ -392,6 +392,8 @@ def _scaled(values: NDArray, span: tuple[float, float]) -> NDArray[np.uint8]:
 
 def _by_profile(image: Image.Image) -> Image.Image:
     """CMYK by the image's own colour profile, if it has a usable one; LAB as the standard defines it."""
+    from PIL import ImageCms
+
     rgb = ImageCms.createProfile("sRGB")
     if image.mode == "LAB":
         return _transformed(image, ImageCms.createProfile("LAB"), rgb)
@@ -404,6 +406,8 @@ def _by_profile(image: Image.Image) -> Image.Image:
 
 
 def _transformed(image: Image.Image, source: object, target: object) -> Image.Image:
+    from PIL import ImageCms
+
     made = ImageCms.profileToProfile(image, source, target, outputMode="RGB")  # type: ignore[arg-type]
     if made is None:
         raise ValueError(f"its colours ({image.mode}) cannot be converted")

@@ -81,10 +81,10 @@ def _imported_files(path: Path, root: Path) -> tuple[Path, ...]:
         names |= {module, *(f"{module}.{name.decode()}" for name in re.findall(rb"\w+", imported))}
     inside = {n for n in names if n.startswith(f"{PACKAGE}.")}
     inside |= {n.rsplit(".", k)[0] for n in inside for k in range(1, n.count("."))}
-    files = (file for name in sorted(inside - PLUMBING) for file in _files_of(name, root))
-    return tuple(file for file in files if file.is_file())
+    files = (file for name in sorted(inside - PLUMBING) for file in _files_of(name, str(root)))
+    return tuple(Path(file) for file in files if os.path.isfile(file))
 
 
-def _files_of(name: str, root: Path) -> tuple[Path, Path]:
-    base = root.joinpath(*name.split(".")[1:])
-    return base.with_suffix(".py"), base / "__init__.py"
+def _files_of(name: str, root: str) -> tuple[str, str]:
+    base = os.path.join(root, *name.split(".")[1:])
+    return f"{base}.py", os.path.join(base, "__init__.py")
