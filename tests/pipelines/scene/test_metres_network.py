@@ -10,7 +10,7 @@ import pytest
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.networks.card import Card
 from msgs_slam.pipelines.networks.registry import ModelStore
-from msgs_slam.pipelines.scene.network import SMALL_SD, network_scale, retake
+from msgs_slam.pipelines.scene.metres import SMALL_SD, network_scale, retake
 from msgs_slam.pipelines.scene.view import SeenFrame
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 from tests.networks import save_network

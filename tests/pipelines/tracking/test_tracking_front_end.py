@@ -13,7 +13,7 @@ from msgs_slam.pipelines.sfm.features import extract_features
 from msgs_slam.pipelines.sfm.flow import corners, follow
 from msgs_slam.pipelines.sfm.matching import match_descriptors
 from msgs_slam.pipelines.system.values import load_value, save_value
-from msgs_slam.pipelines.tracking.extend import triangulate
+from msgs_slam.pipelines.tracking.front_end import triangulate
 from msgs_slam.pipelines.tracking.pnp import interpolate_pose, predict_pose, solve_pose
 from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
