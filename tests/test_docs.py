@@ -96,17 +96,6 @@ def test_every_benchmark_is_on_its_page() -> None:
     assert [path.name for path in BENCHMARKS.glob("*.py") if path.name not in page] == []
 
 
-def test_options_of_benchmarks_exist() -> None:
-    """What is given to a script is among its texts, without the dashes where it makes its options in a loop."""
-    commands = re.findall(r"python tests/benchmarks/(\w+\.py)((?:\\\n|[^\n`#])*)", texts())
-    assert len({name for name, _ in commands}) > 20
-    for name, rest in commands:
-        tree = ast.parse((BENCHMARKS / name).read_text(encoding="utf-8"))
-        made = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
-        for option in re.findall(r"(?<=\s)--[a-z-]+", rest):
-            assert option in made or option[2:] in made, f"{name} {option}"
-
-
 def test_constants_that_a_benchmark_changes_stand_in_the_code() -> None:
     tree = ast.parse((BENCHMARKS / "constants.py").read_text(encoding="utf-8"))
     tables = [
@@ -121,11 +110,12 @@ def test_constants_that_a_benchmark_changes_stand_in_the_code() -> None:
 
 def test_commands_of_benchmarks_are_understood(tmp_path: Path) -> None:
     """Every script starts and its own parser takes what the pages give it; nothing is measured."""
-    commands = re.findall(r"python (tests/benchmarks/\w+\.py)((?:\\\n|[^\n`#>|])*)", texts())
-    words = [[name, *shlex.split(re.sub(r"\\\n|\[[^\]]*\]", " ", rest))] for name, rest in commands]
+    commands = re.findall(r"python (?:-m )?(tests[/.]benchmarks[/.]\w+(?:\.py)?)((?:\\\n|[^\n`#>|])*)", texts())
+    words = [[name, *shlex.split(re.sub(r"\\\n|\.{3}|[][]", " ", rest))] for name, rest in commands]
     scripts = [p for p in sorted(BENCHMARKS.glob("*.py")) if '"__main__"' in p.read_text(encoding="utf-8")]
-    helps = [[str(p.relative_to(ROOT)), "--help"] for p in scripts]
-    given = json.dumps([[str(ROOT / w[0]), *w[1:]] for w in words + helps])
+    words += [[str(p.relative_to(ROOT)), "--help"] for p in scripts]
+    assert len(words) > len(scripts) + 40
+    given = json.dumps([[str(ROOT / w[0]) if w[0].endswith(".py") else w[0], *w[1:]] for w in words])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(BENCHMARKS)])}
     done = subprocess.run(
         [sys.executable, "-c", _PARSES, given], cwd=tmp_path, env=environment, capture_output=True, text=True
@@ -146,7 +136,8 @@ for command in json.loads(sys.argv[1]):
     sys.argv, path, said, code = list(command), list(sys.path), io.StringIO(), "it went on without parsing"
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            runpy.run_path(command[0], run_name="__main__")
+            run = runpy.run_path if command[0].endswith(".py") else runpy.run_module
+            run(command[0], run_name="__main__")
     except SystemExit as end:
         code = end.code
     except ImportError as error:  # of an extra that is not installed, of ours not: an architecture test says which
@@ -327,44 +318,3 @@ def test_metadata_agrees_with_itself() -> None:
     assert f"version: {project['version']}" in citation
     assert project["urls"]["Method"].removeprefix("https://doi.org/") in citation
     assert project["description"] in (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-
-
-STARTED_ON_PAPER = """
-import argparse, contextlib, io, runpy, shlex, sys
-sys.path[:0] = [".", "tests/benchmarks"]
-parse = argparse.ArgumentParser.parse_args
-
-def stop_when_parsed(self, *given, **more):
-    parse(self, *given, **more)
-    sys.exit(0)
-
-argparse.ArgumentParser.parse_args = stop_when_parsed
-for line in sys.stdin.read().splitlines():
-    sys.argv, said, code = shlex.split(line, comments=True), io.StringIO(), "it asks for no options"
-    run = runpy.run_path if sys.argv[0].endswith(".py") else runpy.run_module
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-        try:
-            run(sys.argv[0], run_name="__main__")
-        except SystemExit as end:
-            code = end.code
-        except Exception as error:
-            code = repr(error)
-    if code != 0:
-        print(line, code, said.getvalue()[-300:])
-"""
-
-
-def test_every_benchmark_starts_and_takes_the_options_of_its_page() -> None:
-    """In one process, as far as the options are read."""
-    page = (ROOT / "tests/benchmarks/README.md").read_text(encoding="utf-8").replace("\\\n", " ")
-    lines = [
-        re.sub(r"\.{3}|[][]", "", found) for found in re.findall(r"^    python (?:-m )?(tests\S.*)", page, re.MULTILINE)
-    ]
-    scripts = [p for p in (ROOT / "tests/benchmarks").glob("*.py") if "__main__" in p.read_text(encoding="utf-8")]
-    lines += [f"{p.relative_to(ROOT).as_posix()} --help" for p in sorted(scripts)]
-    assert len(lines) > len(scripts) + 40
-    done = subprocess.run(
-        [sys.executable, "-c", STARTED_ON_PAPER], input="\n".join(lines), capture_output=True, text=True, cwd=ROOT
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == ""
