@@ -10,46 +10,25 @@ from typing import Any
 
 import pytest
 
-from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.errors import DiskFullError
 from msgs_slam.pipelines.config import STAGES, Config
-from msgs_slam.pipelines.engine.runner import run_stages
-from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.ending import RECORD, discard, empty, find_sealed
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
-from msgs_slam.pipelines.system.progress import SilentProgress
+from tests.pipelines.engine.recorder import Recorder
 
 CALLS = ("replace", "rename", "unlink", "rmdir", "mkdir", "fsync", "open")
 KILLED = 99
 OTHER = "mapping.hold_out=4"
 
 
-class Stages:
-    """Two stages of which the second, mapping, calls `at_end` with its last line; notes which have run."""
-
-    def __init__(self, at_end: Callable[[], None] = lambda: None) -> None:
-        self.ran: list[str] = []
-        self.at_end = at_end
-
-    def bring(self, root: Path, config: Config | None = None, **changes: Any) -> list[str]:
-        self.ran.clear()
-        root.mkdir(exist_ok=True)
-        stages = [replace(Stage(name, self._make(name)), **changes) for name in STAGES]
-        run_stages(stages, RunFolder(root), Path("v.mp4"), "d", config or Config(), SilentProgress(), "mapping")
-        return list(self.ran)
-
-    def _make(self, name: str) -> Callable[[StageContext], dict[str, Any]]:
-        def run(context: StageContext) -> dict[str, Any]:
-            self.ran.append(name)
-            write_text(context.snapshot / "half.txt", "half")
-            for number in range(2):
-                write_text(context.folder / "folder" / f"{number}.txt", f"{name} {number} {context.config.mapping}")
-            if name == "mapping":
-                self.at_end()
-            return {"number": float("inf")}
-
-        return run
+def bring(
+    root: Path, config: Config | None = None, at_end: Callable[[], None] = lambda: None, **changes: Any
+) -> list[str]:
+    """Up to mapping, whose last line is `at_end`; which stages ran."""
+    recorder = Recorder(at_end)
+    stages = [replace(stage, **changes) for stage in recorder.stages()]
+    return recorder.bring(root, config, until="mapping", stages=stages)
 
 
 def contents(root: Path) -> dict[str, bytes]:
@@ -77,7 +56,7 @@ def killed_at(root: Path, config: Config, count: int) -> bool:
                 setattr(os, name, dying(getattr(os, name)))
 
         try:
-            Stages(arm).bring(root, config)
+            bring(root, config, arm)
             os._exit(0)
         finally:
             os._exit(1)
@@ -90,9 +69,9 @@ def killed_at(root: Path, config: Config, count: int) -> bool:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, bytes]]:
     """A run whose mapping is made again with OTHER, and what it holds then."""
     root = tmp_path_factory.mktemp("finished") / "r"
-    Stages().bring(root)
+    bring(root)
     other = shutil.copytree(root, root.with_name("other"))
-    Stages().bring(other, load_config(overrides=[OTHER]))
+    bring(other, load_config(overrides=[OTHER]))
     return root, contents(other)
 
 
@@ -109,7 +88,7 @@ def test_a_kill_at_any_call_loses_no_finished_stage(finished: tuple[Path, dict[s
         known = "mapping" in load_records(run)
         kept = (run.partial("mapping") / "snapshot" / "half.txt").exists()
         assert ended or known or kept
-        ran = Stages().bring(copy, config)
+        ran = bring(copy, config)
         assert ran == ([] if ended or known else ["mapping"])
         assert contents(copy) == wanted
         assert not list(copy.glob("*.partial"))
@@ -129,7 +108,7 @@ def interrupted(root: Path, monkeypatch: pytest.MonkeyPatch, *settings: str, **c
     with monkeypatch.context() as patch:
         patch.setattr("msgs_slam.pipelines.engine.runner.move_in", stop)
         with pytest.raises(KeyboardInterrupt):
-            Stages().bring(root, config, **changes)
+            bring(root, config, **changes)
 
 
 def test_a_changed_file_or_other_work_is_not_taken_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,7 +121,7 @@ def test_a_changed_file_or_other_work_is_not_taken_over(tmp_path: Path, monkeypa
         if change == "the record":
             sealed.write_text(sealed.read_text()[:-20])
         config = load_config(overrides=["frames.rate=1"]) if change == "settings" else None
-        ran = Stages().bring(root, config)
+        ran = bring(root, config)
         assert ran == list(STAGES[:4])[change == "nothing" :]
         assert not list(root.rglob(RECORD))
 
@@ -154,20 +133,22 @@ def test_parts_of_another_size_are_not_taken_over(tmp_path: Path, monkeypatch: p
     interrupted(tmp_path / "r", monkeypatch, "run.memory_mb=2100", division=division)
     shutil.copytree(tmp_path / "r", tmp_path / "s")
     same, other = (load_config(overrides=[f"run.memory_mb={mb}"]) for mb in (2100, 900))
-    assert Stages().bring(tmp_path / "r", same, division=division)[0] == "proxy"
-    assert Stages().bring(tmp_path / "s", other, division=division)[0] == "frames"
+    assert bring(tmp_path / "r", same, division=division)[0] == "proxy"
+    assert bring(tmp_path / "s", other, division=division)[0] == "frames"
 
 
 def test_a_disk_that_is_full_for_the_manifest_costs_no_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise DiskFullError("no room")
 
-    stages = Stages(lambda: monkeypatch.setattr("msgs_slam.pipelines.engine.runner.write_manifest", full))
+    def fill() -> None:
+        monkeypatch.setattr("msgs_slam.pipelines.engine.runner.write_manifest", full)
+
     with pytest.raises(DiskFullError):
-        stages.bring(tmp_path / "r")
+        bring(tmp_path / "r", at_end=fill)
     monkeypatch.undo()
     assert list(load_records(RunFolder(tmp_path / "r"))) == ["frames", "proxy", "tracking"]
-    assert Stages().bring(tmp_path / "r") == []
+    assert bring(tmp_path / "r") == []
     assert find_sealed(RunFolder(tmp_path / "r"), "mapping", "") is None
 
 
@@ -184,12 +165,12 @@ def test_files_that_a_network_disk_keeps_for_others_stop_nothing(
             Path(folder).mkdir()
             (Path(folder) / ".nfs0001").touch()
 
-    Stages().bring(tmp_path / "r")
+    bring(tmp_path / "r")
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "rmtree", leaving)
-        assert Stages().bring(tmp_path / "r", load_config(overrides=[OTHER])) == ["mapping"]
+        assert bring(tmp_path / "r", load_config(overrides=[OTHER])) == ["mapping"]
         (tmp_path / "r" / "proxy" / "folder" / "0.txt").unlink()
-        assert Stages().bring(tmp_path / "r", load_config(overrides=[OTHER])) == ["proxy", "tracking", "mapping"]
+        assert bring(tmp_path / "r", load_config(overrides=[OTHER])) == ["proxy", "tracking", "mapping"]
         empty(tmp_path / "r" / "proxy")
         assert not list((tmp_path / "r" / "proxy").iterdir())
     discard(tmp_path / "r" / "mapping")

@@ -1,44 +1,17 @@
 """The stage runner on small stages: what is up to date stays, what changed runs, what was interrupted goes on."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.errors import DiskFullError, InputError
 from msgs_slam.pipelines.config import STAGES, Config, MappingConfig
-from msgs_slam.pipelines.engine.runner import run_stages
-from msgs_slam.pipelines.engine.stages import SameSource, Stage, StageContext
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
-from msgs_slam.pipelines.system.progress import SilentProgress
-
-
-class Recorder:
-    """Six stages that note when they run; each writes a file made from its own setting and its predecessor's file."""
-
-    def __init__(self) -> None:
-        self.ran: list[str] = []
-        self.fail_in = ""
-        self.error: BaseException = KeyboardInterrupt()
-
-    def stages(self) -> list[Stage]:
-        return [Stage(name, self.make(name)) for name in STAGES]
-
-    def make(self, name: str) -> Any:
-        def run(context: StageContext) -> dict[str, Any]:
-            self.ran.append(name)
-            before = STAGES[STAGES.index(name) - 1] if name != STAGES[0] else None
-            text = (context.run.stage(before) / "result.txt").read_text() if before else "source"
-            write_text(context.snapshot / "half.txt", "half")
-            if name == self.fail_in:
-                raise self.error
-            write_text(context.folder / "result.txt", f"{text} > {name} {getattr(context.config, name)}")
-            return {"length": len(text)}
-
-        return run
+from tests.pipelines.engine.recorder import Recorder
 
 
 @pytest.fixture
@@ -46,28 +19,17 @@ def recorder() -> Recorder:
     return Recorder()
 
 
-def bring_up_to_date(
-    recorder: Recorder, root: Path, config: Config | None = None, digest: str = "d", until: str = "export"
-) -> list[str]:
-    recorder.ran.clear()
-    root.mkdir(exist_ok=True)
-    run_stages(
-        recorder.stages(), RunFolder(root), Path("video.mp4"), digest, config or Config(), SilentProgress(), until
-    )
-    return list(recorder.ran)
-
-
 def test_second_run_does_nothing(recorder: Recorder, tmp_path: Path) -> None:
-    assert bring_up_to_date(recorder, tmp_path / "r") == list(STAGES)
-    assert bring_up_to_date(recorder, tmp_path / "r") == []
+    assert recorder.bring(tmp_path / "r") == list(STAGES)
+    assert recorder.bring(tmp_path / "r") == []
     assert not list((tmp_path / "r").rglob("snapshot"))
 
 
 def test_changed_setting_reruns_its_stage_and_what_follows(recorder: Recorder, tmp_path: Path) -> None:
-    bring_up_to_date(recorder, tmp_path / "r")
+    recorder.bring(tmp_path / "r")
     key = next(iter(MappingConfig.__dataclass_fields__.values()))
     config = load_config(overrides=[f"mapping.{key.name}={another_value(key.default)}"])
-    assert bring_up_to_date(recorder, tmp_path / "r", config) == ["mapping", "global_ba", "export"]
+    assert recorder.bring(tmp_path / "r", config) == ["mapping", "global_ba", "export"]
 
 
 def another_value(value: Any) -> Any:
@@ -77,15 +39,15 @@ def another_value(value: Any) -> Any:
 
 
 def test_until_stops_there_and_leaves_nothing_stale_behind(recorder: Recorder, tmp_path: Path) -> None:
-    bring_up_to_date(recorder, tmp_path / "r")
+    recorder.bring(tmp_path / "r")
     (tmp_path / "r" / "proxy" / "result.txt").unlink()
-    assert bring_up_to_date(recorder, tmp_path / "r", until="proxy") == ["proxy"]
+    assert recorder.bring(tmp_path / "r", until="proxy") == ["proxy"]
     assert not (tmp_path / "r" / "export").exists()
-    assert bring_up_to_date(recorder, tmp_path / "r") == ["tracking", "mapping", "global_ba", "export"]
+    assert recorder.bring(tmp_path / "r") == ["tracking", "mapping", "global_ba", "export"]
 
 
 def test_damaged_file_is_made_again(recorder: Recorder, tmp_path: Path) -> None:
-    bring_up_to_date(recorder, tmp_path / "r")
+    recorder.bring(tmp_path / "r")
     damaged = tmp_path / "r" / "global_ba" / "result.txt"
     damaged.write_text(damaged.read_text()[:-1] + "?")
     run = RunFolder(tmp_path / "r")
@@ -95,28 +57,26 @@ def test_damaged_file_is_made_again(recorder: Recorder, tmp_path: Path) -> None:
     (tmp_path / "r" / "export" / "result.txt").unlink()
     with pytest.raises(InputError, match=r"result.txt is gone"):
         run.file("export", "result.txt")
-    assert bring_up_to_date(recorder, tmp_path / "r") == ["global_ba", "export"]
+    assert recorder.bring(tmp_path / "r") == ["global_ba", "export"]
 
 
 def test_other_source_or_seed_reruns_all(recorder: Recorder, tmp_path: Path) -> None:
-    bring_up_to_date(recorder, tmp_path / "r")
-    assert bring_up_to_date(recorder, tmp_path / "r", digest="e") == list(STAGES)
+    recorder.bring(tmp_path / "r")
+    assert recorder.bring(tmp_path / "r", digest="e") == list(STAGES)
     config = Config()
-    assert bring_up_to_date(recorder, tmp_path / "r", replace(config, run=replace(config.run, seed=1)), "e") == list(
-        STAGES
-    )
+    assert recorder.bring(tmp_path / "r", replace(config, run=replace(config.run, seed=1)), "e") == list(STAGES)
 
 
 def test_interrupted_stage_keeps_its_snapshot(recorder: Recorder, tmp_path: Path) -> None:
     recorder.fail_in = "mapping"
     with pytest.raises(KeyboardInterrupt):
-        bring_up_to_date(recorder, tmp_path / "r")
+        recorder.bring(tmp_path / "r")
     run = RunFolder(tmp_path / "r")
     assert list(load_records(run)) == ["frames", "proxy", "tracking"]
     assert (run.partial("mapping") / "snapshot" / "half.txt").exists()
     (run.partial("mapping") / ".torn.tmp.npz").write_bytes(b"x")
     recorder.fail_in = ""
-    assert bring_up_to_date(recorder, tmp_path / "r") == ["mapping", "global_ba", "export"]
+    assert recorder.bring(tmp_path / "r") == ["mapping", "global_ba", "export"]
     assert not list(run.root.glob("*.partial"))
     assert not list(run.root.rglob(".torn*"))
 
@@ -128,14 +88,9 @@ def test_nothing_is_given_up_for_a_source_that_is_another_one(recorder: Recorder
         asked.append(True)
         raise InputError("the source has changed")
 
-    def bring(config: Config, source: SameSource = same_source) -> None:
-        run_stages(
-            recorder.stages(), run, Path("video.mp4"), "d", config, SilentProgress(), "export", source
-        )  # fmt: skip
-
     run = RunFolder(tmp_path / "r")
-    run.root.mkdir()
-    bring(Config(), lambda: None)
+    bring = partial(recorder.bring, run.root, same_source=same_source)
+    recorder.bring(run.root)
     bring(load_config(overrides=["mapping.hold_out=4"]))
     assert asked == []  # frames are done: the source is not needed
     bring(Config())
@@ -152,20 +107,20 @@ def test_nothing_is_given_up_for_a_source_that_is_another_one(recorder: Recorder
 def test_snapshot_of_other_settings_is_dropped(recorder: Recorder, tmp_path: Path) -> None:
     recorder.fail_in = "frames"
     with pytest.raises(KeyboardInterrupt):
-        bring_up_to_date(recorder, tmp_path / "r")
+        recorder.bring(tmp_path / "r")
     stale = tmp_path / "r" / "frames.partial" / "stale.txt"
     stale.write_text("of the first settings")
     recorder.fail_in = ""
-    bring_up_to_date(recorder, tmp_path / "r", load_config(overrides=["frames.rate=1"]))
+    recorder.bring(tmp_path / "r", load_config(overrides=["frames.rate=1"]))
     assert not (tmp_path / "r" / "frames" / "stale.txt").exists()
 
 
 def test_full_disk_is_said_and_can_be_resumed(recorder: Recorder, tmp_path: Path) -> None:
     recorder.fail_in, recorder.error = "tracking", OSError(28, "No space left on device")
     with pytest.raises(DiskFullError, match="msgs-slam resume"):
-        bring_up_to_date(recorder, tmp_path / "r")
+        recorder.bring(tmp_path / "r")
     recorder.fail_in = ""
-    assert bring_up_to_date(recorder, tmp_path / "r") == ["tracking", "mapping", "global_ba", "export"]
+    assert recorder.bring(tmp_path / "r") == ["tracking", "mapping", "global_ba", "export"]
 
 
 def test_inputs_of_a_stage_are_looked_at_first_and_rerun_it_when_they_change(
@@ -179,15 +134,9 @@ def test_inputs_of_a_stage_are_looked_at_first_and_rerun_it_when_they_change(
             raise InputError(f"{maps} is not there")
         return maps.read_text()
 
-    def bring(config: Config | None = None) -> list[str]:
-        recorder.ran.clear()
-        stages = recorder.stages()
-        stages[1] = replace(stages[1], inputs=inputs, check=lambda source, config: checked.append(maps.read_text()))
-        root = tmp_path / "r"
-        root.mkdir(exist_ok=True)
-        run_stages(stages, RunFolder(root), Path("video.mp4"), "d", config or Config(), SilentProgress())
-        return list(recorder.ran)
-
+    stages = recorder.stages()
+    stages[1] = replace(stages[1], inputs=inputs, check=lambda source, config: checked.append(maps.read_text()))
+    bring = partial(recorder.bring, tmp_path / "r", stages=stages)
     with pytest.raises(InputError, match="is not there"):
         bring()
     assert recorder.ran == []
@@ -212,11 +161,7 @@ def test_memory_that_divides_a_stage_otherwise_makes_it_again(recorder: Recorder
     stages[0] = replace(stages[0], division=lambda run, config: config.run.memory_mb // 1000)
 
     def bring(memory_mb: int) -> list[str]:
-        recorder.ran.clear()
-        config = load_config(overrides=[f"run.memory_mb={memory_mb}"])
-        (tmp_path / "r").mkdir(exist_ok=True)
-        run_stages(stages, RunFolder(tmp_path / "r"), Path("video.mp4"), "d", config, SilentProgress())
-        return list(recorder.ran)
+        return recorder.bring(tmp_path / "r", load_config(overrides=[f"run.memory_mb={memory_mb}"]), stages=stages)
 
     assert bring(2100) == list(STAGES)
     assert bring(2900) == []
@@ -230,12 +175,7 @@ def test_a_finished_stage_keeps_what_auto_has_chosen(recorder: Recorder, tmp_pat
     stages = recorder.stages()
     stages[1] = replace(stages[1], inputs=lambda source, config: dict(there), auto=lambda config: tuple(auto))
 
-    def bring() -> list[str]:
-        recorder.ran.clear()
-        (tmp_path / "r").mkdir(exist_ok=True)
-        run_stages(stages, RunFolder(tmp_path / "r"), Path("video.mp4"), "d", Config(), SilentProgress())
-        return list(recorder.ran)
-
+    bring = partial(recorder.bring, tmp_path / "r", stages=stages)
     assert bring() == list(STAGES)
     there["labels"] = "a network"
     assert bring() == []
