@@ -126,7 +126,7 @@ class MapOptimiser:
             values = {k: parameters[k] for k in KEYS}
         else:  # what the view does not show has no gradient and would wait anyway
             rows = in_view(*seeing)
-            values = {k: parameters[k].detach()[rows].requires_grad_() for k in KEYS}
+            values = {k: parameters[k].detach().index_select(0, rows).requires_grad_() for k in KEYS}
         refines = self.settings.refine_poses and step.refine_pose
         rendering = self.draw(view, pose.requires_grad_(refines), values)
         if self.settings.exposure:
@@ -218,7 +218,8 @@ class MapOptimiser:
         The paper has small steps where depth is unreliable. Measured, the contrary helps: what stands in the wrong
         place has farther to go, and colours have to lead it there.
         """
-        trust = self.state.parameters.trust if rows is None else self.state.parameters.trust[rows]
+        trust = self.state.parameters.trust
+        trust = trust if rows is None else trust.index_select(0, rows)
         shares = torch.where(trust > LOW_RELIABILITY, math.sqrt(LOW_TRUST_STEP), LOW_TRUST_STEP)
         shares = torch.where(trust > HIGH_RELIABILITY, 1.0, shares)
         return {**dict.fromkeys(KEYS, shares), "means": shares * torch.exp(log_radii)}

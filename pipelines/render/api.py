@@ -57,7 +57,7 @@ def render(
         return Rendering(shown, kernels.depth_ratio(above, below), silhouette)
     if not torch.is_grad_enabled():
         rows = in_view(means, radii, pose, intrinsics, near)
-        means, radii, opacities, features = means[rows], radii[rows], opacities[rows], features[rows]
+        means, radii, opacities, features = (x.index_select(0, rows) for x in (means, radii, opacities, features))
     u, v, sigma_px, z = project_map(means, radii, pose, intrinsics, near)
     image = composite(u, v, sigma_px, z, opacities, features, intrinsics.width, intrinsics.height, backend, near)
     depth = depth_ratio(image.depth_sum, image.depth_silhouette)

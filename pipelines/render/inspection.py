@@ -109,8 +109,9 @@ def class_weights(
     seen = (means.detach(), radii.detach(), opacities.detach())
     if (module := _compiled(backend, means)) is not None:
         rows = in_view(means, radii, cam_from_world, intrinsics, NEAR)
-        projected = project_map(seen[0][rows], seen[1][rows], cam_from_world, intrinsics)
-        return rows, module.class_weights(*projected, seen[2][rows], NEAR, counts, channels, classes)
+        means, radii, opacities = (x.index_select(0, rows) for x in seen)
+        projected = project_map(means, radii, cam_from_world, intrinsics)
+        return rows, module.class_weights(*projected, opacities, NEAR, counts, channels, classes)
     # A rendering changes with a Gaussian's features by the Gaussian's part in each pixel.
     pixels = channels.reshape(-1, 1).long()
     weight = counts.reshape(-1, 1) * (pixels < classes)
@@ -137,9 +138,10 @@ def error_shares(
     seen = (means.detach(), radii.detach(), opacities.detach())
     if (module := _compiled(None, means)) is not None:
         rows = in_view(*seen[:2], cam_from_world, intrinsics)
-        u, v, sigma_px, z = project_map(seen[0][rows], seen[1][rows], cam_from_world, intrinsics)
+        means, radii, opacities, colors = (x.index_select(0, rows) for x in (*seen, colors))
+        u, v, sigma_px, z = project_map(means, radii, cam_from_world, intrinsics)
         size = (intrinsics.width, intrinsics.height)
-        given = (u, v, sigma_px, z, seen[2][rows], colors[rows], *size, NEAR, error_of)
+        given = (u, v, sigma_px, z, opacities, colors, *size, NEAR, error_of)
         found = (module.weighted_errors(*given), sigma_px)
         errors, footprints = (torch.zeros_like(seen[1]).index_copy(0, rows, x) for x in found)
         return errors, footprints
@@ -182,9 +184,9 @@ def _inspect(
         return found
     require_finite("opacities", opacities)
     rows = in_view(means, radii, cam_from_world, intrinsics, near)
-    drawn = means.detach()[rows], radii.detach()[rows]
+    drawn = means.detach().index_select(0, rows), radii.detach().index_select(0, rows)
     projected = project_map(*drawn, cam_from_world.detach(), intrinsics, near=near)
     module, size = choose_backend(backend, means), (intrinsics.width, intrinsics.height)
-    median, *weights = module.inspect(*projected, opacities.detach()[rows], *size, near, counts)
+    median, *weights = module.inspect(*projected, opacities.detach().index_select(0, rows), *size, near, counts)
     total, largest = (torch.zeros_like(radii.detach()).index_copy(0, rows, weight) for weight in weights)
     return median, total, largest
