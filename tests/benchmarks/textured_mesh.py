@@ -21,12 +21,11 @@ from scipy.ndimage import binary_fill_holes
 
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.pipelines.compute.raster import draw_faces
 from msgs_slam.pipelines.evaluation.image_quality import psnr
-from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import WORLD
-from msgs_slam.pipelines.system.jit import kernel
 from msgs_slam.pipelines.types import Intrinsics
 
 SAMPLES = 2
@@ -105,13 +104,10 @@ class Drawer:
     def draw(self, cam_from_world: NDArray, camera: Intrinsics) -> tuple[NDArray, NDArray]:
         """color (H, W, 3) 0..1, covered (H, W) bool: every sample of the pixel shows a face."""
         fine = camera.resized(camera.width * SAMPLES, camera.height * SAMPLES)
-        in_cam = self.vertices @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
-        xy, z = project(in_cam, fine)
-        face, shares = np.full((fine.height, fine.width), -1, np.int32), np.zeros((fine.height, fine.width, 3))
-        draw_faces(np.nan_to_num(xy), np.where(z > 1e-3, z, 0), self.faces, face, shares)
-        hit = face >= 0
+        drawn = draw_faces(self.vertices, self.faces, cam_from_world, fine)
+        hit = drawn.face >= 0
         color = np.zeros((*hit.shape, 3), np.float32)
-        color[hit] = self.colors_at(face[hit], shares[hit])
+        color[hit] = self.colors_at(drawn.face[hit], drawn.shares[hit])
         blocks = (camera.height, SAMPLES, camera.width, SAMPLES)
         return color.reshape(*blocks, 3).mean(axis=(1, 3)), hit.reshape(blocks).all(axis=(1, 3))
 
@@ -147,36 +143,6 @@ class Textured(Drawer):
             part = slice(a, a + 30000)
             out[part] = cv2.remap(self.picture, x[None, part], y[None, part], cv2.INTER_LINEAR)[0] / np.float32(255)
         return out
-
-
-@kernel
-def draw_faces(xy, z, faces, face, shares):  # type: ignore[no-untyped-def]
-    """The nearest face at every sample, with perspective-correct barycentric shares; z 0 = behind the camera."""
-    height, width = face.shape
-    nearest = np.full((height, width), np.inf)
-    for f in range(len(faces)):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        if z[a] <= 0 or z[b] <= 0 or z[c] <= 0:
-            continue
-        ax, ay, bx, by, cx, cy = xy[a, 0], xy[a, 1], xy[b, 0], xy[b, 1], xy[c, 0], xy[c, 1]
-        twice = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-        if twice == 0:
-            continue
-        for row in range(max(int(min(ay, by, cy) - 0.5), 0), min(int(max(ay, by, cy) + 0.5), height - 1) + 1):
-            for column in range(max(int(min(ax, bx, cx) - 0.5), 0), min(int(max(ax, bx, cx) + 0.5), width - 1) + 1):
-                x, y = column + 0.5, row + 0.5
-                q = ((x - ax) * (cy - ay) - (cx - ax) * (y - ay)) / twice
-                r = ((bx - ax) * (y - ay) - (x - ax) * (by - ay)) / twice
-                p = 1 - q - r
-                if p < 0 or q < 0 or r < 0:
-                    continue
-                p, q, r = p / z[a], q / z[b], r / z[c]
-                depth = 1 / (p + q + r)
-                if depth < nearest[row, column]:
-                    nearest[row, column], face[row, column] = depth, f
-                    shares[row, column, 0] = p * depth
-                    shares[row, column, 1] = q * depth
-                    shares[row, column, 2] = r * depth
 
 
 if __name__ == "__main__":

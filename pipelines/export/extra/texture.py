@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from ....formats.mesh import MeshArrays, TexturedMesh
+from ...compute.raster import draw_faces
 from ...compute.threads import for_each
-from ...geometry.camera import project
+from ...geometry.camera import resample_nearest
 from ...geometry.posed_depth import PosedDepth
 from ...outcome import Outcome
 from ...system.jit import kernel
@@ -24,45 +25,43 @@ from .holes import filled, normal_sums
 TEXTURE_SIDE = 4096
 """A texture has at most this many pixels a side: what viewers on the web and phones take."""
 
-AGREES = 0.03
-"""Relative difference up to which the depth of a view confirms that it sees a place."""
+_SAME = 0.01
+"""Relative difference up to which a texel is what a view has of the mesh in its pixel, beside the slope in a pixel."""
+_HIDDEN = 0.1
+"""A view does not see a place whose depth the map has in front of it by more than this part."""
 POWER = 2.0
 """A view counts with this power of its pixels a length on the surface, times how sharp it is. The mean of many views
 lies nearer to each of them than that of the best: on kitchen 24.4 dB instead of 23.5 with six views and 4."""
 _FEATHER = 0.04
-"""Weights fade over this part of the image's width beside its rim and beside steps of the depth."""
+"""Weights fade over this part of the image's width beside its rim and beside what is hidden."""
 _BAND = 64
 
 
 @dataclass(frozen=True)
 class Shot:
     """A keyframe to paint from: what it sees as depth, its full camera, how sharp it is among the others (1 = as most),
-    and `photo` () -> (H, W, 3) float32 0..1 without exposure."""
+    and `photo` () -> (H, W, 3) float32 0..1 without exposure, and what of it is `hidden` (H, W), None = nothing."""
 
     depth_view: PosedDepth
     camera: Intrinsics
     sharpness: float
     photo: Callable[[], NDArray[np.float32]]
+    hidden: NDArray[np.bool_] | None = None
 
 
 def texels_wanted(vertices: NDArray[np.float32], faces: NDArray[np.int32], shots: Sequence[Shot]) -> float:
     """Texels a unit of length at which nine of ten vertices keep the pixels of the view that sees them closest."""
     normals = vertex_normals(vertices, faces)
-    density = functools.reduce(np.maximum, (_density(vertices, normals, shot)[0] for shot in shots))
+    density = functools.reduce(np.maximum, (_density(vertices, normals, shot) for shot in shots))
     return float(np.quantile(density[density > 0], 0.9)) if (density > 0).any() else 1.0
 
 
 def paint_texture(atlas: Atlas, shots: Sequence[Shot], progress: Progress) -> NDArray[np.uint8]:
     """(height, width, 3) RGB; what no view sees has its vertices' colours, what no face covers those beside it."""
-    vertices, faces = atlas.mesh.vertices, atlas.mesh.faces
-    normals, owner = vertex_normals(vertices, faces), owners(atlas)
-    of_each = (view_weights(vertices, normals, shot) for shot in shots)
-    best = np.maximum(functools.reduce(np.maximum, of_each), np.finfo(np.float32).tiny)
+    owner = owners(atlas)
     total = np.zeros((atlas.height, atlas.width, 4), np.float32)
     for shot in progress.track(shots, "texture", len(shots)):
-        weight = (view_weights(vertices, normals, shot) / best).astype(np.float32, copy=False)
-        if weight.any():
-            _add(total, owner, atlas, shot, weight[atlas.corner_vertex])
+        _add(total, owner, atlas, shot)
     base = (atlas.mesh.colors / np.float32(255))[atlas.corner_vertex]
     _in_bands(atlas.height, lambda a, b: _finish(total[a:b], owner[a:b], a, atlas.corners, atlas.corner_faces, base))
     return np.round(_filled(total)[..., :3].clip(0, 1) * 255).astype(np.uint8)
@@ -74,60 +73,50 @@ def vertex_normals(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> N
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
 
 
-def view_weights(vertices: NDArray[np.float32], normals: NDArray[np.float64], shot: Shot) -> NDArray[np.float32]:
-    """(V,) how much a shot counts at each vertex beside others: 0 where it does not see it."""
-    weights = np.zeros(len(vertices), np.float32)
-    density, place = _density(vertices, normals, shot)
-    seen = density > 0
-    feather = _feather(shot.depth_view)[place[seen, 1], place[seen, 0]]
-    weights[seen] = (shot.sharpness * density[seen]) ** POWER * feather
-    return weights
-
-
-def _density(
-    vertices: NDArray[np.float32], normals: NDArray[np.float64], shot: Shot
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """(V,) pixels a unit of length along the foreshortened direction, 0 where unseen; (V, 2) pixel of the view."""
+def _density(vertices: NDArray[np.float32], normals: NDArray[np.float64], shot: Shot) -> NDArray[np.float64]:
+    """(V,) pixels a unit of length along the foreshortened direction, 0 for vertices that the map hides."""
     view, pose = shot.depth_view, shot.depth_view.cam_from_world
-    in_cam = vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-    xy, z = project(in_cam, view.intrinsics)
-    size = np.array([view.intrinsics.width, view.intrinsics.height])
-    inside = np.all((xy >= 0) & (xy < size), axis=1)
+    xy, z, inside = view.seen(vertices.astype(np.float64))
     place = np.where(inside.reshape(-1, 1), xy, 0).astype(np.int64)
-    depth, weight = view.depth[place[:, 1], place[:, 0]], view.trust[place[:, 1], place[:, 0]]
-    seen = inside & (weight > 0) & (np.abs(depth - z) < AGREES * np.abs(z))
+    seen = (
+        inside & (view.trust[place[:, 1], place[:, 0]] > 0) & (view.depth[place[:, 1], place[:, 0]] > (1 - _HIDDEN) * z)
+    )
+    in_cam = vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
     towards = -(normals @ pose[:3, :3].T * in_cam).sum(1) / np.maximum(np.linalg.norm(in_cam, axis=1), 1e-9)
-    density = shot.camera.fx * towards / np.where(seen, z, 1)
-    return np.where(seen, density.clip(0), 0), place
+    return np.where(seen, (shot.camera.fx * towards / np.where(seen, z, 1)).clip(0), 0)
 
 
-def _feather(view: PosedDepth) -> NDArray[np.float32]:
-    """(H, W) 0..1: distance from the rim of what the view sees, in units of `_FEATHER`."""
-    valid = np.pad((view.trust > 0).astype(np.uint8), 1)
-    away = cv2.distanceTransform(valid, cv2.DIST_L2, 3)[1:-1, 1:-1]
-    return np.minimum(away / (_FEATHER * view.depth.shape[1]), 1).astype(np.float32)
+def _seen(atlas: Atlas, shot: Shot) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
+    """(F,) the faces that a pixel of the photograph shows; (H, W) of it: depth of the mesh, and 0..1 how far from the
+    rim of what shows it a pixel lies, in units of `_FEATHER`. What the map knows in front of the mesh hides it, but no
+    step that the map has a few pixels beside the mesh's: painted by that, rims would have the colours of what is
+    behind them."""
+    view, camera = shot.depth_view, shot.camera
+    drawn = draw_faces(atlas.mesh.vertices, atlas.mesh.faces, view.cam_from_world, camera)
+    mesh, is_shown = drawn.depth, np.zeros(len(atlas.mesh.faces), bool)
+    is_shown[drawn.face[drawn.face >= 0]] = True
+    known = np.where(view.trust > 0, view.depth, np.inf).astype(np.float32)
+    shows = (mesh > 0) & (resample_nearest(known, camera.height, camera.width) > (1 - _HIDDEN) * mesh)
+    if shot.hidden is not None:
+        shows &= ~shot.hidden
+    away = cv2.distanceTransform(np.pad(shows.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    return is_shown, mesh, np.minimum(away / (_FEATHER * camera.width), 1).astype(np.float32)
 
 
 def _in_bands(rows: int, task: Callable[[int, int], None]) -> None:
     for_each(lambda n: task(n * _BAND, min((n + 1) * _BAND, rows)), -(-rows // _BAND))
 
 
-def _add(
-    total: NDArray[np.float32], owner: NDArray[np.int32], atlas: Atlas, shot: Shot, weight: NDArray[np.float32]
-) -> None:
+def _add(total: NDArray[np.float32], owner: NDArray[np.int32], atlas: Atlas, shot: Shot) -> None:
     """Add what the shot shows at each texel, times its weight there."""
-    view, k, small = shot.depth_view, shot.camera, shot.depth_view.intrinsics
-    pose, photo = view.cam_from_world, np.ascontiguousarray(shot.photo(), np.float32)
+    pose, photo = shot.depth_view.cam_from_world, np.ascontiguousarray(shot.photo(), np.float32)
     in_cam = (atlas.mesh.vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])[atlas.corner_vertex]
-    camera = np.array([k.fx, k.fy, k.cx, k.cy, small.width / k.width, small.height / k.height])
-    depth = np.where(view.trust > 0, view.depth, 0).astype(np.float32)
-
-    def band(a: int, b: int) -> None:
-        _sample(
-            total[a:b], owner[a:b], a, atlas.corners, atlas.corner_faces, in_cam, weight, photo, depth, camera, AGREES
-        )
-
-    _in_bands(atlas.height, band)
+    of_mesh = (atlas.corners, atlas.corner_faces, in_cam)
+    camera, seen = np.array(shot.camera.numbers, np.float64), _seen(atlas, shot)
+    _in_bands(
+        atlas.height,
+        lambda a, b: _sample(total[a:b], owner[a:b], a, *of_mesh, photo, *seen, camera, shot.sharpness, POWER, _SAME),
+    )
 
 
 @kernel
@@ -143,28 +132,34 @@ def _shares(x, y, corners, a, b, c):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sample(total, owner, top, corners, faces, in_cam, weight, photo, depth, camera, agrees):  # type: ignore[no-untyped-def]
+def _sample(total, owner, top, corners, faces, in_cam, photo, shown, depth, trust, camera, sharpness, power, same):  # type: ignore[no-untyped-def]
     rows, columns = owner.shape
-    height, width = photo.shape[:2]
-    fx, fy, cx, cy, ratio_x, ratio_y = camera
+    height, width = depth.shape
+    fx, fy, cx, cy = camera
+    normal, last = np.zeros(3), -1
     for row in range(rows):
         for column in range(columns):
             f = owner[row, column]
-            if f < 0:
+            if f < 0 or not shown[f]:
                 continue
             a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-            if weight[a] + weight[b] + weight[c] <= 0:
-                continue
+            if f != last:
+                normal, last = np.cross(in_cam[b] - in_cam[a], in_cam[c] - in_cam[a]), f
+                normal /= max(np.sqrt((normal**2).sum()), 1e-300)
             p, q, r = _shares(column + 0.5, row + top + 0.5, corners, a, b, c)
-            share = p * weight[a] + q * weight[b] + r * weight[c]
+            x = p * in_cam[a, 0] + q * in_cam[b, 0] + r * in_cam[c, 0]
+            y = p * in_cam[a, 1] + q * in_cam[b, 1] + r * in_cam[c, 1]
             z = p * in_cam[a, 2] + q * in_cam[b, 2] + r * in_cam[c, 2]
-            if share <= 0 or z <= 0:
+            if z <= 0:
                 continue
-            u = fx * (p * in_cam[a, 0] + q * in_cam[b, 0] + r * in_cam[c, 0]) / z + cx
-            v = fy * (p * in_cam[a, 1] + q * in_cam[b, 1] + r * in_cam[c, 1]) / z + cy
+            u, v = fx * x / z + cx, fy * y / z + cy
             if u < 0.5 or v < 0.5 or u >= width - 0.5 or v >= height - 0.5:
                 continue
-            if abs(depth[int(v * ratio_y), int(u * ratio_x)] - z) >= agrees * z:
+            along = abs(normal[0] * x + normal[1] * y + normal[2] * z) / np.sqrt(x * x + y * y + z * z)
+            if abs(depth[int(v), int(u)] - z) >= (same + 1 / (fx * max(along, 1e-3))) * z:
+                continue
+            share = trust[int(v), int(u)] * (sharpness * fx * along / z) ** power
+            if share <= 0:
                 continue
             left, above = int(u - 0.5), int(v - 0.5)
             right, below = min(left + 1, width - 1), min(above + 1, height - 1)
@@ -188,7 +183,7 @@ def _finish(total, owner, top, corners, faces, base):  # type: ignore[no-untyped
             a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
             p, q, r = _shares(column + 0.5, row + top + 0.5, corners, a, b, c)
             for k in range(3):
-                if weight > 1e-12:
+                if weight > 0:
                     total[row, column, k] /= weight
                 else:
                     total[row, column, k] = p * base[a, k] + q * base[b, k] + r * base[c, k]
@@ -233,14 +228,8 @@ def _shots(outcome: Outcome, views: Sequence[PosedDepth]) -> Sequence[Shot]:
 
 
 def _shot(outcome: Outcome, frame: Frame, view: PosedDepth, sharpness: float) -> Shot:
-    hidden = outcome.run.left_out(frame)
-    if hidden is not None:
-        size = (view.depth.shape[1], view.depth.shape[0])
-        kept = cv2.resize(hidden.astype(np.uint8), size, interpolation=cv2.INTER_AREA) == 0
-        view = replace(view, trust=np.where(kept, view.trust, 0).astype(np.float32))
-
     def photo() -> NDArray[np.float32]:
         picture = outcome.run.image(frame).astype(np.float32) / np.float32(255)
         return picture if outcome.exposure is None else outcome.exposure.remove(picture, frame.timestamp)
 
-    return Shot(view, outcome.calibration.intrinsics, sharpness, photo)
+    return Shot(view, outcome.calibration.intrinsics, sharpness, photo, outcome.run.left_out(frame))

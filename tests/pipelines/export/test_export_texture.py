@@ -1,16 +1,19 @@
 """A lighter mesh, its charts, and a texture painted from views whose truth is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
 
 from msgs_slam.formats.mesh import MeshArrays
+from msgs_slam.pipelines.compute.raster import draw_faces
 from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.export.extra import texture
 from msgs_slam.pipelines.export.extra.atlas import Atlas, owners, simplified, unwrapped
 from msgs_slam.pipelines.export.extra.holes import filled
-from msgs_slam.pipelines.export.extra.texture import Shot, paint_texture, texels_wanted, vertex_normals, view_weights
+from msgs_slam.pipelines.export.extra.texture import Shot, paint_texture, texels_wanted
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Intrinsics
@@ -131,19 +134,52 @@ def test_what_nobody_sees_has_the_vertices_colours(atlas: Atlas) -> None:
 
 def test_no_texel_is_left_black(atlas: Atlas) -> None:
     """What lies beside charts goes on with their colours, for small pictures of the texture."""
-    nothing = shot(0.0)
-    nothing.depth_view.trust[:] = 0
+    nothing = replace(SHOTS[0], hidden=np.ones((FULL.height, FULL.width), bool))
     assert (owners(atlas) < 0).any()
     assert (paint_texture(atlas, [nothing], SilentProgress()) == 128).all()
 
 
 def test_blurred_and_hidden_views_count_less(atlas: Atlas) -> None:
-    vertices, normals = atlas.mesh.vertices, vertex_normals(atlas.mesh.vertices, atlas.mesh.faces)
-    shots = (SHOTS[0], shot(0.0, sharpness=0.5), SHOTS[6])
-    weights = np.stack([view_weights(vertices, normals, one) for one in shots])
-    seen = weights[0] > 0
-    np.testing.assert_allclose(weights[1, seen], weights[0, seen] / 2**texture.POWER, rtol=1e-5)
-    assert not (seen & (weights[2] > 0)).any()  # the other side
+    dark, light = np.zeros((FULL.height, FULL.width, 3), np.float32), np.ones((FULL.height, FULL.width, 3), np.float32)
+    views = [shot(0.0, photo=dark), shot(0.0, sharpness=0.5, photo=light), shot(np.pi, photo=light)]
+    both = paint_texture(atlas, views, SilentProgress())
+    inside, points = places(atlas)
+    ahead = points @ views[0].depth_view.cam_from_world[2, :3] < -0.5 * RADIUS
+    share = 0.5**texture.POWER / (1 + 0.5**texture.POWER)
+    np.testing.assert_allclose(both[inside][ahead], round(255 * share), atol=1)
+
+
+def test_a_map_that_is_not_the_mesh_paints_up_to_its_rims(atlas: Atlas) -> None:
+    """Its depth is off by twentieths, and knows nothing of some pixels; what is seen of the mesh decides."""
+    view = SHOTS[0].depth_view
+    depth, trust = view.depth * np.float32(1.05), view.trust.copy()
+    trust[:, 75:85] = 0
+    other = paint_texture(
+        atlas, [replace(SHOTS[0], depth_view=replace(view, depth=depth, trust=trust))], SilentProgress()
+    )
+    np.testing.assert_array_equal(other, paint_texture(atlas, SHOTS[:1], SilentProgress()))
+
+
+def test_faces_in_a_picture_meet_without_gaps_and_may_reach_behind_the_camera() -> None:
+    """A floor of two triangles from behind the camera to a wall of many, by the true depth of both."""
+    side = 40
+    y, x = np.mgrid[:side, :side] / (side - 1)
+    wall = np.stack([6 * x - 3, 4 * y - 3, np.full((side, side), 4.0)], axis=-1).reshape(-1, 3)
+    a = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
+    faces = np.concatenate([np.stack([a, a + 1, a + side], 1), np.stack([a + 1, a + side + 1, a + side], 1)])
+    floor = np.array([[-3, 1, -5], [3, 1, -5], [3, 1, 4], [-3, 1, 4.0]])
+    points = np.concatenate([wall, floor])
+    faces = np.concatenate([faces, len(wall) + np.array([[0, 1, 2], [0, 2, 3]])]).astype(np.int32)
+    drawn = draw_faces(points, faces, np.eye(4), CAMERA)
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width] + 0.5
+    slope = (v - CAMERA.cy) / CAMERA.fy
+    expected = np.where(slope > 0.25, 1 / np.maximum(slope, 0.25), 4.0)
+    np.testing.assert_allclose(drawn.depth, expected, rtol=1e-5)
+    place = drawn.blend(points, faces)
+    np.testing.assert_allclose(place[..., 0], (u - CAMERA.cx) / CAMERA.fx * expected, atol=1e-4)
+    nothing = draw_faces(points - np.array([0, 0, 20]), faces, np.eye(4), CAMERA)
+    assert (nothing.face == -1).all()
+    assert (nothing.depth == 0).all()
 
 
 def test_an_occluder_in_front_is_not_painted_on(atlas: Atlas) -> None:
