@@ -75,7 +75,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.unlink(missing_ok=True)
         yield temporary
-        _flush_to_disk(temporary)
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
         os.replace(temporary, path)
         for call in _after_write:
             call(path)
@@ -128,11 +129,6 @@ def copy_file(source: Path, target: Path) -> None:
     the source cannot be read, and as `atomic_path` does."""
     with opened(source, any_content=True) as file, atomic_path(target) as temporary, temporary.open("wb") as copy:
         shutil.copyfileobj(file, copy, _AT_ONCE)
-
-
-def _flush_to_disk(path: Path) -> None:
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())
 
 
 def _is_of_another(error: OSError, path: Path, temporary: Path) -> bool:

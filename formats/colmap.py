@@ -101,7 +101,7 @@ def read_colmap_model(folder: Path) -> ColmapModel:
 
 def _plain_model(reconstruction: Any, folder: Path) -> ColmapModel:
     images = sorted((reconstruction.images[i] for i in reconstruction.reg_image_ids()), key=lambda image: image.name)
-    camera_ids = sorted({image.camera_id for image in images})
+    cameras = (reconstruction.cameras[i] for i in sorted({image.camera_id for image in images}))
     found = ModelArrays.of(reconstruction, [image.image_id for image in images])
     poses = [image.cam_from_world() for image in images]
     return ColmapModel(
@@ -111,7 +111,7 @@ def _plain_model(reconstruction: Any, folder: Path) -> ColmapModel:
             np.array([pose.translation for pose in poses], dtype=np.float64).reshape(-1, 3),
             str(folder),
         ),
-        cameras=tuple(_plain_camera(reconstruction.cameras[i]) for i in camera_ids),
+        cameras=tuple((c.model.name, int(c.width), int(c.height), tuple(map(float, c.params))) for c in cameras),
         points=found.points,
         colors=np.array([reconstruction.points3D[i].color for i in found.point_ids.tolist()], np.uint8).reshape(-1, 3),
         obs_image=found.obs_cam,
@@ -160,10 +160,6 @@ def _load(folder: Path) -> Any:
     with parsing(f"the COLMAP model in {folder}", "such model"):
         (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))
     return reconstruction
-
-
-def _plain_camera(camera: Any) -> tuple[str, int, int, tuple[float, ...]]:
-    return camera.model.name, int(camera.width), int(camera.height), tuple(float(p) for p in camera.params)
 
 
 @dataclass(frozen=True)

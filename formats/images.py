@@ -101,7 +101,7 @@ def read_rgb(path: Path, reading: Reading = AS_STATED) -> NDArray[np.uint8]:
         is_wide = reading.span is not None and is_deep_colour(image)  # first: asking a PNG for EXIF loads it
         turn = _turn(image, reading)
         if is_wide and reading.span is not None:
-            image = Image.fromarray(decode_deep_colour(read_bytes(Path(path)), reading.span))
+            image = Image.fromarray(_scaled(decode_16_bits(read_bytes(Path(path))), reading.span))
         image.load()
         return to_rgb8(image if turn is None else image.transpose(turn), reading.span)
 
@@ -360,11 +360,6 @@ def is_deep_colour(image: Image.Image) -> bool:
     return (
         image.format in ("PNG", "TIFF") and image.mode in ("RGB", "RGBA") and ";16" in str(getattr(image, "tile", ""))
     )
-
-
-def decode_deep_colour(data: bytes, span: tuple[float, float]) -> NDArray[np.uint8]:
-    """Return (H, W, 3) uint8 of a PNG or TIFF of three or four channels of 16 bits, not turned."""
-    return _scaled(decode_16_bits(data), span)
 
 
 def decode_16_bits(data: bytes) -> NDArray[np.uint16]:

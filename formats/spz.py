@@ -57,9 +57,7 @@ def spz_bytes(cloud: GaussianCloud, version: int) -> bytes:
         _byte(opacity * 255).tobytes(),
         _byte((cloud.colors - 0.5) / SH_C0 * (_COLOR_SCALE * 255) + 0.5 * 255).tobytes(),
         _byte((cloud.log_scales + 10) * 16).tobytes(),
-        (_three_bytes if version == 2 else _packed_rotations)(
-            cloud.quat_wxyz[:, [1, 2, 3, 0]] * np.append(_FLIP, 1)
-        ).tobytes(),
+        _packed_rotations(cloud.quat_wxyz[:, [1, 2, 3, 0]] * np.append(_FLIP, 1), version).tobytes(),
     ]
     if version == 4:
         return _container_4(streams, len(cloud), fraction_bits)
@@ -170,13 +168,11 @@ def _first_three(data: NDArray[np.uint8]) -> NDArray[np.float64]:
     return np.concatenate([xyz, w], axis=1)
 
 
-def _three_bytes(quat_xyzw: NDArray) -> NDArray[np.uint8]:
-    """(M, 3) of (M, 4), as `_first_three` reads them."""
-    return _byte((quat_xyzw[:, :3] * np.where(quat_xyzw[:, 3:] < 0, -1, 1) + 1) * 127.5)
-
-
-def _packed_rotations(quat_xyzw: NDArray) -> NDArray[np.uint32]:
-    """(M,) of (M, 4), as `_smallest_three` reads them: the largest component is made positive and left out."""
+def _packed_rotations(quat_xyzw: NDArray, version: int) -> NDArray[np.uint8] | NDArray[np.uint32]:
+    """(M,) of (M, 4), as `_smallest_three` reads them: the largest component is made positive and left out; of version
+    2 (M, 3), as `_first_three` reads them."""
+    if version == 2:
+        return _byte((quat_xyzw[:, :3] * np.where(quat_xyzw[:, 3:] < 0, -1, 1) + 1) * 127.5)
     largest = np.abs(quat_xyzw).argmax(axis=1)
     sign = np.where(np.take_along_axis(quat_xyzw, largest[:, None], 1) < 0, -1, 1)
     quat = quat_xyzw * sign / np.maximum(np.linalg.norm(quat_xyzw, axis=1, keepdims=True), 1e-12)

@@ -125,12 +125,9 @@ def json_stderr() -> Iterator[None]:
             write_line("error", message=error.format_message(), exit_code=code)
         except Exception as error:
             code = 1
-            write_line("error", message=f"{type(error).__name__}: {error}", exit_code=code, traceback=_trace(error))
+            trace = "".join(traceback.format_exception(error))
+            write_line("error", message=f"{type(error).__name__}: {error}", exit_code=code, traceback=trace)
     sys.exit(code)
-
-
-def _trace(error: BaseException) -> str:
-    return "".join(traceback.format_exception(error))
 
 
 @contextmanager

@@ -78,7 +78,8 @@ class FriendlyGroup(click.Group):
             flush_output()
             return result
         except InputError as error:
-            raise _refused(error) from error
+            kind = SettingRefused if isinstance(error, SettingError) else click.ClickException
+            raise kind(printable(str(error))) from error
         except KeyboardInterrupt as error:
             raise Interrupted("stopped by Ctrl-C") from error
         except SystemError as error:
@@ -92,11 +93,6 @@ class FriendlyGroup(click.Group):
             raise click.ClickException(
                 printable(f"{where}: {error.strerror}. Change that, then run it again")
             ) from error
-
-
-def _refused(error: InputError) -> click.ClickException:
-    kind = SettingRefused if isinstance(error, SettingError) else click.ClickException
-    return kind(printable(str(error)))
 
 
 class SettingRefused(click.ClickException):

@@ -90,7 +90,7 @@ class RunStatus:
             f"{s.name}: its folder is gone: {again}"
             if not self.run.stage(s.name).exists()
             else f"{s.name}: {len(s.damaged)} of its {len(s.record.files)} files are missing or damaged "
-            f"({_few(s.damaged)}): {again}"
+            f"({', '.join(s.damaged[:5])}{', ...' if len(s.damaged) > 5 else ''}): {again}"
             for s in self.stages
             if s.damaged and s.record
         ]
@@ -238,7 +238,3 @@ def _state(run: RunFolder, name: str, record: StageRecord | None, damaged: tuple
     if run.partial(name).exists():
         return INTERRUPTED
     return OUTDATED if run.stage(name).exists() else NOT_YET
-
-
-def _few(names: tuple[str, ...], limit: int = 5) -> str:
-    return ", ".join(names[:limit]) + (", ..." if len(names) > limit else "")

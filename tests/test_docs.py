@@ -45,11 +45,6 @@ def test_commands_and_options_exist() -> None:
             assert option in options, f"msgs-slam {name} {option}"
 
 
-def test_every_command_is_in_the_readme_or_the_help() -> None:
-    told = (main.help or "") + DOCS[0].read_text(encoding="utf-8")
-    assert [name for name in main.commands if f"msgs-slam {name}" not in told] == []
-
-
 @pytest.mark.parametrize("setting", sorted(set(re.findall(r"--set ([a-z_]+\.[a-z_]+=\S+?)[\s`'\"),;]", texts() + " "))))
 def test_settings_exist(setting: str) -> None:
     load_config(overrides=[setting])

@@ -204,7 +204,7 @@ def _continue(url: str, part: Path, size: int, progress: Callable[[int, int], No
         if size not in (0, total):
             raise _NotTheFile(f"the file there has {total} bytes, expected {size}")
         size = total
-        _write_tag(part, answer.headers.get("ETag") or "")
+        _tag_file(part).write_text(json.dumps({"etag": answer.headers.get("ETag") or ""}), encoding="utf-8")
         with part.open("ab" if continues else "wb") as stream:
             for chunk in _chunks(answer):
                 done += len(chunk)
@@ -230,10 +230,6 @@ def _read_tag(part: Path) -> str:
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return ""
     return tag if isinstance(tag, str) and _ETAG.fullmatch(tag) else ""
-
-
-def _write_tag(part: Path, tag: str) -> None:
-    _tag_file(part).write_text(json.dumps({"etag": tag}), encoding="utf-8")
 
 
 def _discard(part: Path) -> None:

@@ -57,7 +57,10 @@ class ModelStore:
     def open(cache: Path | None = None, table: Path = _TABLE) -> ModelStore:
         """The store of this user. `MSGS_SLAM_CACHE` names another cache folder."""
         values = _parsed(table.read_text(encoding="utf-8"))
-        rows = [Model(**{**row, "urls": _addresses(row)}) for row in values["model"]]
+        rows = []
+        for row in values["model"]:
+            urls = tuple(url.format(revision=row.get("revision") or "main") for url in row["urls"])
+            rows.append(Model(**{**row, "urls": urls}))
         store = ModelStore(cache or default_cache(), tuple(rows), values["family"])
         own = store._load_own()
         pinned = own["pinned"]
@@ -281,10 +284,6 @@ def missing_networks() -> str | None:
     size = sum(m.bytes for m in store.with_needed([])) / 1e6
     named = ", ".join(lacks)
     return f"Optional networks not installed ({named}; {size:.0f} MB): msgs-slam models pull"
-
-
-def _addresses(row: dict[str, Any]) -> tuple[str, ...]:
-    return tuple(url.format(revision=row.get("revision") or "main") for url in row["urls"])
 
 
 def _room_classes(count: int) -> dict[str, list[str]]:

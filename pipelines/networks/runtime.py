@@ -219,7 +219,7 @@ class TfliteRuntime:
         try:
             return self._run(outputs, feed)
         except ValueError as error:  # of an input that does not fit, or a tensor that a damaged file leaves empty
-            raise RuntimeError(_first_line(error)) from error
+            raise RuntimeError((str(error).strip().splitlines() or [type(error).__name__])[0]) from error
 
     def _run(self, outputs: Sequence[str], feed: dict[str, NDArray]) -> list[NDArray]:
         for name, values in feed.items():
@@ -304,7 +304,3 @@ def _real(values: NDArray, detail: dict[str, Any]) -> NDArray:
     if values.dtype.kind == "f" or not scale:
         return values
     return ((values.astype(np.float32) - np.float32(zero)) * np.float32(scale)).astype(np.float32)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

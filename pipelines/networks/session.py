@@ -78,7 +78,9 @@ class Network:
         mean, std = np.array(card.mean, np.float32), np.array(card.std, np.float32)
         # Padding of the mean colour: 0 after normalisation, here or in the graph.
         pad = mean * 255 if any(card.mean) else np.array(_IMAGENET_MEAN, np.float32)
-        values = (box.put(image, pad) * np.float32(card.white / 255) - mean * card.white) / (std * _std_unit(card))
+        if any(s != 1.0 for s in card.std):  # in units of white too; of 1, the default, nothing is divided
+            std *= card.white
+        values = (box.put(image, pad) * np.float32(card.white / 255) - mean * card.white) / std
         batch = np.ascontiguousarray(values.transpose(2, 0, 1)[None]).astype(self._dtype)
         feed: dict[str, NDArray] = {card.input: batch}
         if card.tokens:
@@ -115,11 +117,6 @@ def _with_metadata(card: Card, metadata: dict[str, str]) -> Card:
                 found[word] = tuple(n / 255 if max(numbers) > 5 else n for n in numbers)
                 break
     return replace(card, mean=found["mean"], std=found["std"]) if len(found) == 2 else card
-
-
-def _std_unit(card: Card) -> float:
-    """std is in units of white too; a std of 1 (the default) means that nothing is divided."""
-    return 1.0 if all(s == 1.0 for s in card.std) else card.white
 
 
 def _require_whole(card: Card) -> None:
@@ -220,13 +217,9 @@ def choose_box(width: int, height: int, size: tuple[int, ...], multiple: int, pi
     columns = max(1, round(width * ideal / multiple))
     best = min(
         (max(1, c) for c in (columns - 1, columns, columns + 1)),
-        key=lambda c: _aspect_error(c, max(1, round(c * height / width)), width, height),
+        key=lambda c: abs(math.log(c * height / (max(1, round(c * height / width)) * width))),
     )
     return Letterbox(width, height, best * multiple, max(1, round(best * height / width)) * multiple)
-
-
-def _aspect_error(columns: int, rows: int, width: int, height: int) -> float:
-    return abs(math.log(columns * height / (rows * width)))
 
 
 def _interpolate(values: NDArray[np.float32], at: NDArray[np.float64], axis: int) -> NDArray[np.float32]:

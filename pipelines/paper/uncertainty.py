@@ -51,11 +51,6 @@ def semantic_agreement(labels: NDArray[np.uint8], shown: NDArray[np.uint8]) -> f
     return float(mean_iou(labels, shown[None])[0])
 
 
-def reliability_class(u: NDArray, constants: Constants = PAPER) -> NDArray[np.int64]:
-    """(h, w) 2 where U is high (depth leads), 1 where it is medium, 0 where it is low (colour and semantics lead)."""
-    return np.digitize(u, [constants.tau_low, constants.tau_high], right=True)
-
-
 @dataclass(frozen=True)
 class MirrorPlane:
     """Points x with normal · x = offset; confidence in [0, 1], 0 where no symmetry stands out from chance."""

@@ -25,14 +25,10 @@ _KINDS = {"f": "f", "i": "iu", "b": "b", "u": "U"}
 _RIGID = 1e-4
 
 
-def what_to_do(path: Path) -> str:
-    """Advice for a file of a run that cannot be used."""
-    return f"delete {path.name} and run `msgs-slam resume` for this run: the stage that wrote it makes it again"
-
-
 def reading(path: Path, what: str) -> Any:
     """Around code that takes apart what a run's file holds: whatever it raises becomes an InputError."""
-    return parsing(path, what, what_to_do(path))
+    advice = f"delete {path.name} and run `msgs-slam resume` for this run: the stage that wrote it makes it again"
+    return parsing(path, what, advice)
 
 
 @dataclass(frozen=True)

@@ -187,9 +187,9 @@ def verify_matches(
     """Robust two-view geometry of proposed matches, or None. See `match_pair`."""
     if not _may_agree(xy[0][matches[:, 0]], xy[1][matches[:, 1]]):
         return None
-    geometry = pycolmap.estimate_two_view_geometry(
-        camera, xy[0], camera, xy[1], matches, _verification_options(pair_seed(seed, pair))
-    )
+    pair_seed = int(np.random.SeedSequence([seed, *pair]).generate_state(1)[0] & 0x7FFFFFFF)
+    options = _verification_options(pair_seed)
+    geometry = pycolmap.estimate_two_view_geometry(camera, xy[0], camera, xy[1], matches, options)
     inliers = np.asarray(geometry.inlier_matches, dtype=np.uint32).reshape(-1, 2)
     if len(inliers) < MIN_INLIERS:
         return None
@@ -208,11 +208,6 @@ def _may_agree(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
     except cv2.error:  # it finds no model at all where a camera only turns: that is for the full look to say
         return True
     return inliers is not None and int(inliers.sum()) >= _NEARLY * MIN_INLIERS
-
-
-def pair_seed(seed: int, pair: tuple[int, int]) -> int:
-    """A seed below 2^31 for each pair."""
-    return int(np.random.SeedSequence([seed, *pair]).generate_state(1)[0] & 0x7FFFFFFF)
 
 
 def _matrix(value: NDArray[np.float64] | None) -> NDArray[np.float64]:

@@ -106,7 +106,9 @@ class ImageSource:
     def original(self, index: int) -> Path | None:
         """The image's file, unless other programs would see it turned, transparent or not at all."""
         path = self.sequence.image_paths[index] if self.sequence.image_paths else None
-        return path if path is not None and reusable(path) and self.reading.orientation in (None, 1) else None
+        if path is None or path.suffix.lower() not in WRITTEN_SUFFIXES or not is_plain(path):
+            return None
+        return path if self.reading.orientation in (None, 1) else None
 
     def transparent(self, index: int) -> NDArray[np.bool_] | None:
         """(height, width) pixels of image `index` that its alpha channel makes transparent; None without any."""
@@ -179,11 +181,6 @@ def written_names(names: Iterable[str], root: Path) -> tuple[str, ...]:
             raise InputError(f"{root}: {written[frame]!r} and {name!r} would both become {frame!r}: rename one of them")
         written[frame] = name
     return tuple(written)
-
-
-def reusable(path: Path) -> bool:
-    """Whether the file itself can be the frame: other programs see it as it is seen here."""
-    return path.suffix.lower() in WRITTEN_SUFFIXES and is_plain(path)
 
 
 @dataclass(frozen=True)

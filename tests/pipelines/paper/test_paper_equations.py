@@ -86,7 +86,6 @@ def test_2_reliability_by_hand() -> None:
     assert np.allclose(beside[:, 0], 1)
     assert (uncertainty.reliability(np.zeros((6, 6), np.float32), half) == 0).all()
     assert np.allclose(uncertainty.reliability(1000 * step, half), uncertainty.reliability(step, half))
-    assert uncertainty.reliability_class(np.array([0.2, 0.35, 0.6, 0.9])).tolist() == [0, 0, 1, 2]
 
 
 def test_3_agreement_is_a_rising_step_around_phi() -> None:
