@@ -4,18 +4,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 from click.testing import CliRunner
 from numpy.typing import NDArray
-from onnx import helper
-from test_proxy_networks import const, linear_head, save, stand_in, write_card
+from test_proxy_networks import linear_head, stand_in, write_card
 
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.demo import known_view
 from msgs_slam.pipelines.networks.check import KnownView, check_network
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.system.wording import BAD, GOOD, NOTE
+from tests.networks import PICTURE, save_network
 
 IMAGENET = {"white": 1.0, "mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
 RAW: dict[str, Any] = {"white": 255.0}
@@ -41,24 +40,20 @@ def remembering(
     std = np.array(wants.get("std", [1.0] * 3), np.float32).reshape(3, 1, 1)
     mean = np.array(wants.get("mean", [0.0] * 3), np.float32).reshape(3, 1, 1)
     seen = (view.image.transpose(2, 0, 1) / 255 * wants["white"] - mean) / std
-    unit = 255.0 if wants["white"] == 255 else 1.0
-    constants = {"seen": seen[None], "unit": unit, "answer": answer[None], "fill": fill, **more}
-    weights = [const(name, v) for name, v in constants.items()]
-    nodes = [
-        helper.make_node("Sub", ["x", "seen"], ["apart"]),
-        helper.make_node("Abs", ["apart"], ["off"]),
-        helper.make_node("Div", ["off", "unit"], ["share"]),
-        helper.make_node("ReduceMean", ["share"], ["how"], axes=[1]),
-        helper.make_node("Mul", ["how", "fill"], ["wrong"]),
-        helper.make_node("Add", ["answer", "wrong"], ["y"]),
-    ]
-    nodes += [helper.make_node("Mul", [name, "one_of"], [f"{name}_out"]) for name in more]
-    weights.append(const("one_of", 1))
-    save(path, nodes, weights, "y", [1, len(answer), *view.depth.shape], (1, 3, *view.depth.shape))
-    model = onnx.load(path)
-    for name, values in more.items():
-        model.graph.output.append(helper.make_tensor_value_info(f"{name}_out", onnx.TensorProto.FLOAT, values.shape))
-    onnx.save(model, path)
+    size = ", ".join(map(str, view.depth.shape))
+    extra = [f"float[{str(v.shape)[1:-1]}] {k}_out" for k, v in more.items()]
+    save_network(
+        path, f"float[1, 3, {size}] x",
+        ", ".join([f"float[1, {len(answer)}, {size}] y", *extra]),
+        "apart = Sub (x, seen)",
+        "off = Abs (apart)",
+        "share = Div (off, unit)",
+        "how = ReduceMean <axes = [1]> (share)",
+        "wrong = Mul (how, fill)",
+        "y = Add (answer, wrong)",
+        *(f"{name}_out = Identity ({name})" for name in more),
+        seen=seen[None], unit=255.0 if wants["white"] == 255 else 1.0, answer=answer[None], fill=fill, **more,
+    )  # fmt: skip
 
 
 def depth_card(folder: Path, view: KnownView, answer: NDArray, wants: dict[str, Any], **card: Any) -> Any:
@@ -147,20 +142,16 @@ def transformer(path: Path, before: int, width: int = 8) -> None:
     """A DINOv2-like graph: patches of 14 by one convolution, `before` tokens in front of them, and tokens that know
     of each other."""
     rng = np.random.default_rng(0)
-    weights = [
-        const("kernel", rng.normal(size=(width, 3, 14, 14))),
-        const("shape", [1, width, -1], np.int64),
-        const("first", rng.normal(size=(1, before, width))),
-    ]
-    nodes = [
-        helper.make_node("Conv", ["x", "kernel"], ["maps"], strides=[14, 14]),
-        helper.make_node("Reshape", ["maps", "shape"], ["flat"]),
-        helper.make_node("Transpose", ["flat"], ["patches"], perm=[0, 2, 1]),
-        helper.make_node("ReduceMean", ["patches"], ["mean"], axes=[1]),
-        helper.make_node("Add", ["patches", "mean"], ["told"]),
-        helper.make_node("Concat", ["first", "told"], ["y"], axis=1),
-    ]
-    save(path, nodes, weights, "y", [1, "N", width])
+    save_network(
+        path, PICTURE, f"float[1, N, {width}] y",
+        "maps = Conv <strides = [14, 14]> (x, kernel)",
+        "flat = Reshape (maps, shape)",
+        "patches = Transpose <perm = [0, 2, 1]> (flat)",
+        "mean = ReduceMean <axes = [1]> (patches)",
+        "told = Add (patches, mean)",
+        "y = Concat <axis = 1> (first, told)",
+        kernel=rng.normal(size=(width, 3, 14, 14)), shape=[1, width, -1], first=rng.normal(size=(1, before, width)),
+    )  # fmt: skip
 
 
 def token_card(folder: Path, before: int, head: bool = False, **card: Any) -> Any:

@@ -10,7 +10,7 @@ import onnxruntime
 import pytest
 import torch
 from numpy.typing import NDArray
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb
@@ -39,10 +39,6 @@ FAMILIES = {
 }
 
 
-def const(name: str, value: Any, kind: Any = np.float32) -> onnx.TensorProto:
-    return numpy_helper.from_array(np.array(value, kind), name)
-
-
 def stand_in(path: Path, family: str, canonical_per_metre: float) -> None:
     """A network that reads metres off the red channel (NEAREST + SPAN · red) and answers in its canonical space."""
     white, in_graph, output, axes, rule = FAMILIES[family]
@@ -62,19 +58,6 @@ def stand_in(path: Path, family: str, canonical_per_metre: float) -> None:
         std=np.array(STD).reshape(3, 1, 1), mean=np.array(MEAN).reshape(3, 1, 1),
         start=[2], end=[4], seven=[7], two=[2], four=[4], fourteen=[14], lead=[1, 1],
     )  # fmt: skip
-
-
-def save(path: Path, nodes: list, weights: list, output: str, shape: list, x_shape: tuple = (1, 3, "H", "W")) -> None:
-    graph = helper.make_graph(
-        nodes,
-        "stand-in",
-        [helper.make_tensor_value_info("x", TensorProto.FLOAT, x_shape)],
-        [helper.make_tensor_value_info(output, TensorProto.FLOAT, shape)],
-        weights,
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
-    model.ir_version = 8
-    onnx.save(model, path)
 
 
 def write_card(path: Path, **values: Any) -> Card:
@@ -160,19 +143,19 @@ def test_the_box_is_a_multiple_keeps_the_aspect_and_the_budget(width: int, heigh
     assert min(box.box_width - inner[0], box.box_height - inner[1]) == 0
 
 
-def depth_card(folder: Path, nodes: list, weights: list, output_shape: list, **more: Any) -> Card:
-    save(folder / "net.onnx", nodes, weights, "y", output_shape)
-    keys = {"task": "depth", "model": "net.onnx", "input": "x", "output": "y", "size": [32, 32], **more}
-    return write_card(folder / "c.toml", **keys)
+DEPTH: dict[str, Any] = {"task": "depth", "model": "net.onnx", "input": "x", "output": "y"}
+
+
+def depth_card(folder: Path, output: str, *nodes: str, valid: list[float] = (), **weights: Any) -> Card:
+    save_network(folder / "net.onnx", PICTURE, output, *nodes, **weights)
+    return write_card(folder / "c.toml", **DEPTH, size=[32, 32], **({"valid": valid} if valid else {}))
 
 
 def test_stops_nan_and_negative_values_are_unknown_and_counted(tmp_path: Path) -> None:
     plane = np.full((1, 32, 32), 2.0, np.float32)
     plane[0, 0, 0], plane[0, 8, 8], plane[0, 16, 16], plane[0, 24, 24] = np.nan, -1, 200, 0.1
-    zero = helper.make_node("ReduceSum", ["x"], ["s"], keepdims=0)
-    nodes = [zero, helper.make_node("Mul", ["s", "none"], ["z"]), helper.make_node("Add", ["plane", "z"], ["y"])]
-    weights = [const("none", 0), numpy_helper.from_array(plane, "plane")]
-    card = depth_card(tmp_path, nodes, weights, [1, 32, 32], valid=[0.1, 200.0])
+    nodes = "s = ReduceSum <keepdims = 0> (x)", "z = Mul (s, none)", "y = Add (plane, z)"
+    card = depth_card(tmp_path, "float[1, 32, 32] y", *nodes, none=0.0, plane=plane, valid=[0.1, 200.0])
     camera = Intrinsics(32, 32, 30, 30, 16, 16)
     found = network_depth(Network(card, 1, "cpu"), np.zeros((32, 32, 3), np.uint8), camera)
     depth = found.depth
@@ -183,16 +166,16 @@ def test_stops_nan_and_negative_values_are_unknown_and_counted(tmp_path: Path) -
 
 
 def test_wrong_outputs_and_inputs_are_refused_when_opened(tmp_path: Path) -> None:
-    nodes = [helper.make_node("ReduceMean", ["x"], ["y"], axes=[1], keepdims=0)]
-    card = depth_card(tmp_path, nodes, [], [1, "h", "w"])
+    mean = "y = ReduceMean <axes = [1], keepdims = 0> (x)"
+    card = depth_card(tmp_path, "float[1, h, w] y", mean)
     Network(card, 1, "cpu")
-    keys = {"task": "depth", "model": "net.onnx", "input": "x", "output": "y", "size": [32, 32]}
+    keys = {**DEPTH, "size": [32, 32]}
     for change, said in (({"output": "z"}, "no output 'z'"), ({"input": "pixels"}, "inputs are x")):
         with pytest.raises(InputError, match=said):
             Network(write_card(tmp_path / "d.toml", **{**keys, **change}), 1, "cpu")
     with pytest.raises(InputError, match="sha256"):
         Network(write_card(tmp_path / "d.toml", **keys, sha256="0" * 64), 1, "cpu")
-    save(tmp_path / "net.onnx", nodes, [], "y", [1, 100_000, 100_000])
+    save_network(tmp_path / "net.onnx", PICTURE, "float[1, 100000, 100000] y", mean)
     with pytest.raises(InputError, match="too large"):
         Network(card, 1, "cpu")
     (tmp_path / "net.onnx").write_bytes(b"this is no protobuf at all, but text")
@@ -201,7 +184,7 @@ def test_wrong_outputs_and_inputs_are_refused_when_opened(tmp_path: Path) -> Non
 
 
 def test_an_output_that_is_no_image_is_refused(tmp_path: Path) -> None:
-    card = depth_card(tmp_path, [helper.make_node("ReduceMean", ["x"], ["y"], axes=[2, 3], keepdims=0)], [], [1, 3])
+    card = depth_card(tmp_path, "float[1, 3] y", "y = ReduceMean <axes = [2, 3], keepdims = 0> (x)")
     camera = Intrinsics(32, 32, 30, 30, 16, 16)
     with pytest.raises(InputError, match="image of depth"):
         network_depth(Network(card, 1, "cpu"), np.zeros((32, 32, 3), np.uint8), camera)
@@ -210,25 +193,28 @@ def test_an_output_that_is_no_image_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("side", [15_000, 3_000_000])
 def test_an_output_without_end_is_refused_when_it_comes(tmp_path: Path, side: int) -> None:
     # The size depends on the input, so that nobody can tell it from the graph.
-    weights = [const("side", [side]), const("none", 0), const("one", [1], np.int64)]
-    nodes = [
-        helper.make_node("ReduceSum", ["x"], ["sum"], keepdims=0),
-        helper.make_node("Mul", ["sum", "none"], ["zero"]),
-        helper.make_node("Add", ["zero", "side"], ["length"]),
-        helper.make_node("Cast", ["length"], ["edge"], to=TensorProto.INT64),
-        helper.make_node("Concat", ["one", "edge", "edge"], ["sizes"], axis=0),
-        helper.make_node("Expand", ["zero", "sizes"], ["y"]),
-    ]
-    card = depth_card(tmp_path, nodes, weights, [1, "h", "w"])
+    card = depth_card(
+        tmp_path, "float[1, h, w] y",
+        "sum = ReduceSum <keepdims = 0> (x)",
+        "zero = Mul (sum, none)",
+        "length = Add (zero, side)",
+        "edge = Cast <to = 7> (length)",
+        "sizes = Concat <axis = 0> (one, edge, edge)",
+        "y = Expand (zero, sizes)",
+        side=[float(side)], none=0.0, one=[1],
+    )  # fmt: skip
     with pytest.raises(InputError, match="Correct the card"):
         network_depth(Network(card, 1, "cpu"), np.zeros((32, 32, 3), np.uint8), Intrinsics(32, 32, 30, 30, 16, 16))
 
 
 def external(path: Path, location: str) -> None:
     """A network that keeps a weight in another file."""
-    weight = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[1], data_location=TensorProto.EXTERNAL)
+    model = onnx.load(save_network(path, PICTURE, "float[1, 3, h, w] y", "y = Add (x, w)", w=[1.0]))
+    weight = model.graph.initializer[0]
+    weight.ClearField("raw_data")
+    weight.data_location = TensorProto.EXTERNAL
     weight.external_data.add(key="location", value=location)
-    save(path, [helper.make_node("Add", ["x", "w"], ["y"])], [weight], "y", [1, 3, "h", "w"])
+    onnx.save(model, path)
 
 
 @pytest.mark.parametrize("location", ["../secret.bin", "/etc/passwd", "a/../../secret.bin"])
@@ -240,9 +226,8 @@ def test_weights_outside_the_folder_are_refused_before_anything_is_loaded(
     folder.mkdir()
     (tmp_path / "secret.bin").write_bytes(b"1234")
     external(folder / "net.onnx", location)
-    keys = {"task": "depth", "model": "net.onnx", "input": "x", "output": "y", "size": [32, 32]}
     with pytest.raises(InputError, match="outside its own folder"):
-        Network(write_card(folder / "c.toml", **keys), 1, "cpu")
+        Network(write_card(folder / "c.toml", **DEPTH, size=[32, 32]), 1, "cpu")
 
 
 def test_weights_beside_the_network_are_found_also_in_subgraphs(tmp_path: Path) -> None:
@@ -254,7 +239,7 @@ def test_weights_beside_the_network_are_found_also_in_subgraphs(tmp_path: Path) 
     require_own_weights(tmp_path / "net.onnx")
     inner = onnx.load(tmp_path / "net.onnx", load_external_data=False).graph
     outer = helper.make_node("If", ["c"], ["y"], then_branch=inner, else_branch=inner)
-    save(tmp_path / "outer.onnx", [outer], [], "y", [1])
+    onnx.save(helper.make_model(helper.make_graph([outer], "outer", [], [])), tmp_path / "outer.onnx")
     assert external_locations(tmp_path / "outer.onnx") == ["weights.bin"]
 
 
@@ -275,21 +260,14 @@ def test_weights_beside_the_network_are_found_also_in_subgraphs(tmp_path: Path) 
 )
 def test_cards_that_make_no_sense_are_refused(tmp_path: Path, change: dict[str, Any], said: str) -> None:
     (tmp_path / "net.onnx").write_bytes(b"")
-    keys = {"task": "depth", "model": "net.onnx", "input": "x", "output": "y", **change}
     with pytest.raises(InputError, match=said):
-        write_card(tmp_path / "c.toml", **keys)
+        write_card(tmp_path / "c.toml", **{**DEPTH, **change})
 
 
 def segmentation(folder: Path, scores: NDArray[np.float32], **more: Any) -> Network:
-    zero = helper.make_node("ReduceSum", ["x"], ["s"], keepdims=0)
-    nodes = [zero, helper.make_node("Mul", ["s", "none"], ["z"]), helper.make_node("Add", ["scores", "z"], ["y"])]
-    save(
-        folder / "net.onnx",
-        nodes,
-        [const("none", 0), numpy_helper.from_array(scores, "scores")],
-        "y",
-        list(scores.shape),
-    )
+    nodes = "s = ReduceSum <keepdims = 0> (x)", "z = Mul (s, none)", "y = Add (scores, z)"
+    output = f"float[{', '.join(map(str, scores.shape))}] y"
+    save_network(folder / "net.onnx", PICTURE, output, *nodes, none=0.0, scores=scores)
     keys = {"task": "segmentation", "model": "net.onnx", "input": "x", "output": "y", "size": [64, 64]}
     return Network(write_card(folder / "c.toml", **{**keys, "classes": ["a", "b", "c"], **more}), 1, "cpu")
 
