@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from ball import CAMERA, RADIUS, orbit, pixel_rays, see_ball, seen_points
 from numpy.typing import NDArray
 
 from msgs_slam.formats.mesh import read_mesh_ply, write_mesh_ply
@@ -18,45 +19,14 @@ from msgs_slam.pipelines.export.volume import CHUNK, Grid, Volume, fuse, make_gr
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.mapping.measure import DrawnView
 from msgs_slam.pipelines.system.values import load_value, save_value
-from msgs_slam.pipelines.types import VOID, Intrinsics
+from msgs_slam.pipelines.types import VOID
 
-CAMERA = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
-RADIUS, VOXEL = 0.5, 0.02
-
-
-def orbit(count: int) -> list[NDArray[np.float64]]:
-    """cam_from_world of cameras at a distance of 2 from the origin, looking at it, all round."""
-    poses = []
-    for angle in np.arange(count) * 2 * np.pi / count:
-        forward = -np.array([np.cos(angle), 0.4 * np.sin(3 * angle), np.sin(angle)])
-        forward /= np.linalg.norm(forward)
-        right = np.cross([0.0, 1.0, 0.0], forward)
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-        pose[:3, 3] = -pose[:3, :3] @ (-2.0 * forward)
-        poses.append(pose)
-    return poses
-
-
-def pixel_rays() -> NDArray[np.float64]:
-    y, x = np.mgrid[: CAMERA.height, : CAMERA.width] + 0.5
-    return np.stack([(x - CAMERA.cx) / CAMERA.fx, (y - CAMERA.cy) / CAMERA.fy, np.ones_like(x)], axis=-1)
-
-
-def sphere(pose: NDArray[np.float64]) -> PosedDepth:
-    """Exact z-depth of the sphere at the origin, 0 beside it."""
-    rays, center = pixel_rays(), pose[:3, 3]
-    a, b, c = (rays**2).sum(-1), rays @ center, center @ center - RADIUS**2
-    root = b**2 - a * c
-    depth = np.where(root > 0, (b - np.sqrt(np.maximum(root, 0))) / a, 0).astype(np.float32)
-    return PosedDepth(CAMERA, pose, depth, (depth > 0).astype(np.float32))
+VOXEL = 0.02
 
 
 def painted(view: PosedDepth) -> DrawnView:
     """Where x < 0 in the world channel 0 and red, else channel 1 and blue."""
-    points = (pixel_rays() * view.depth[..., None] - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
-    left = points[..., 0] < 0
+    left = seen_points(view)[..., 0] < 0
     colors = np.where(left[..., None], [204, 0, 0], [0, 0, 204]).astype(np.uint8)
     return DrawnView(view, colors, np.where(left, 0, 1).astype(np.int16))
 
@@ -81,7 +51,7 @@ class Corridor(Sequence[PosedDepth]):
 
 
 def fused(count: int = 24, max_blocks: int = 100_000) -> Volume:
-    views = [sphere(p) for p in orbit(count)]
+    views = orbit(count)
     grid = make_grid(views, VOXEL, 4.0, max_blocks)
     return fuse(grid, all_chunks(grid), views)
 
@@ -153,7 +123,7 @@ def test_chunks_are_welded_without_seams(surface: trimesh.Trimesh) -> None:
 
 
 def test_vertices_carry_colour_and_label_of_their_side(surface: trimesh.Trimesh) -> None:
-    views = (painted(sphere(p)) for p in orbit(24))
+    views = (painted(view) for view in orbit(24))
     colors, labels = paint(np.asarray(surface.vertices, np.float32), views, (7, 3), tolerance=4 * VOXEL)
     clear = np.abs(surface.vertices[:, 0]) > 0.05
     assert set(np.unique(labels)) <= {3, 7, VOID}
@@ -188,9 +158,8 @@ def test_a_step_of_the_depth_leaves_no_slit() -> None:
 
 
 def test_unseen_vertices_are_as_the_nearest_seen_one() -> None:
-    shown = sphere(orbit(1)[0])
-    place = (pixel_rays() * shown.depth[..., None] - shown.cam_from_world[:3, 3]) @ shown.cam_from_world[:3, :3]
-    seen = place[shown.trust > 0][:1]
+    shown = see_ball(0.0)
+    seen = seen_points(shown)[shown.trust > 0][:1]
     points = np.concatenate([seen, seen * 1.5]).astype(np.float32)
     colors, labels = paint(points, [painted(shown)], (3, 7), 2 * VOXEL)
     assert labels[0] != VOID
@@ -199,7 +168,7 @@ def test_unseen_vertices_are_as_the_nearest_seen_one() -> None:
 
 
 def test_unseen_vertices_are_grey_and_void() -> None:
-    colors, labels = paint(np.array([[9, 9, 9]], np.float32), [painted(sphere(orbit(1)[0]))], (0, 1), 0.1)
+    colors, labels = paint(np.array([[9, 9, 9]], np.float32), [painted(see_ball(0.0))], (0, 1), 0.1)
     assert colors.tolist() == [[128, 128, 128]]
     assert labels.tolist() == [VOID]
 
@@ -224,7 +193,7 @@ def test_threads_do_not_change_a_byte() -> None:
 
 
 def test_nothing_seen_gives_an_empty_surface() -> None:
-    view = sphere(orbit(1)[0])
+    view = see_ball(0.0)
     nothing = PosedDepth(CAMERA, view.cam_from_world, view.depth * 0, view.trust * 0)
     grid = make_grid([nothing, nothing], VOXEL, 4.0, 1000)
     assert list(grid.regions()) == []
@@ -259,7 +228,7 @@ def test_small_pieces_go_and_are_counted_over_all_regions() -> None:
 @pytest.mark.parametrize("at_once", [1, 40])
 def test_regions_give_the_mesh_of_the_whole(at_once: int) -> None:
     """The sphere crosses several chunks; not every view sees each. What closes slits depends on the region's faces."""
-    views = [sphere(p) for p in orbit(12)]
+    views = orbit(12)
     whole, parts = (extracted(views, 0.012, n, closing=False) for n in (10_000_000, at_once))
     assert len(whole.vertices) == len(parts.vertices) > 5000
     assert len(whole.faces) == len(parts.faces)

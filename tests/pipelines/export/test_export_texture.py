@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from ball import CAMERA, RADIUS, see_ball, seen_points
 from numpy.typing import NDArray
 
 from msgs_slam.formats.mesh import MeshArrays
@@ -18,9 +19,7 @@ from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Intrinsics
 
-CAMERA = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
 FULL = CAMERA.resized(320, 240)
-RADIUS = 0.5
 
 
 def waves(points: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -29,29 +28,14 @@ def waves(points: NDArray[np.float64]) -> NDArray[np.float32]:
     return (0.5 + 0.4 * np.stack([np.sin(40 * x), np.sin(40 * y), np.sin(40 * z)], axis=-1)).astype(np.float32)
 
 
-def view_of_sphere(angle: float, camera: Intrinsics) -> tuple[NDArray, NDArray, NDArray]:
-    """cam_from_world, exact depth (0 beside the sphere) and picture of the coloured sphere from a distance of 2."""
-    forward = -np.array([np.cos(angle), 0.3 * np.sin(3 * angle), np.sin(angle)])
-    forward /= np.linalg.norm(forward)
-    right = np.cross([0.0, 1.0, 0.0], forward)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = pose[:3, :3] @ (2.0 * forward)
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
-    center = pose[:3, 3]
-    a, b, c = (rays**2).sum(-1), rays @ center, center @ center - RADIUS**2
-    root = b**2 - a * c
-    depth = np.where(root > 0, (b - np.sqrt(np.maximum(root, 0))) / a, 0)
-    points = (rays * depth[..., None] - center) @ pose[:3, :3]
-    return pose, depth.astype(np.float32), np.where(depth[..., None] > 0, waves(points), 0)
+def picture(angle: float) -> NDArray[np.float32]:
+    view = see_ball(angle, FULL)
+    return np.where(view.depth[..., None] > 0, waves(seen_points(view)), 0)
 
 
 def shot(angle: float, sharpness: float = 1.0, photo: NDArray[np.float32] | None = None) -> Shot:
-    pose, depth, _ = view_of_sphere(angle, CAMERA)
-    shown = view_of_sphere(angle, FULL)[2] if photo is None else photo
-    return Shot(PosedDepth(CAMERA, pose, depth, (depth > 0).astype(np.float32)), FULL, sharpness, lambda: shown)
+    shown = picture(angle) if photo is None else photo
+    return Shot(see_ball(angle), FULL, sharpness, lambda: shown)
 
 
 SHOTS = [shot(a) for a in np.arange(12) * np.pi / 6]
@@ -184,10 +168,9 @@ def test_faces_in_a_picture_meet_without_gaps_and_may_reach_behind_the_camera() 
 
 def test_an_occluder_in_front_is_not_painted_on(atlas: Atlas) -> None:
     """A board before one camera, which its depth knows of, leaves no trace."""
-    pose, depth, _ = view_of_sphere(0.0, CAMERA)
-    full = view_of_sphere(0.0, FULL)[2].copy()
-    depth[40:80, 60:100], full[80:160, 120:200] = 1.0, (1.0, 0.0, 1.0)
-    board = Shot(PosedDepth(CAMERA, pose, depth, (depth > 0).astype(np.float32)), FULL, 1.0, lambda: full)
+    view, full = see_ball(0.0), picture(0.0)
+    view.depth[40:80, 60:100], full[80:160, 120:200] = 1.0, (1.0, 0.0, 1.0)
+    board = Shot(replace(view, trust=(view.depth > 0).astype(np.float32)), FULL, 1.0, lambda: full)
     with_board = paint_texture(atlas, [board], SilentProgress())
     assert not ((with_board[..., 0] > 240) & (with_board[..., 1] < 20)).any()
 
