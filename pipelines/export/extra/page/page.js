@@ -18,7 +18,6 @@ async function start() {
   draw = makePicture(canvas, cloud, about.classes.map((c) => c.color), seenFrom(cloud, about));
   find("message").textContent = "";
   find("panel").hidden = bare;
-  find("panel").classList.toggle("folded", innerWidth <= 600);
   addLegend();
   addButtons();
   addPointers();
@@ -46,11 +45,12 @@ function again() {
 }
 
 function lens() {
-  const ratio = window.devicePixelRatio || 1, width = Math.round(innerWidth * ratio), height = Math.round(innerHeight * ratio);
+  const ratio = window.devicePixelRatio || 1, width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
   for (const c of [canvas, overlay]) if (c.width !== width || c.height !== height) Object.assign(c, { width, height });
-  // The whole of a camera's image fits into the window; on a phone held upright a part, else it would be small.
-  const whole = Math.min(height / about.slope[1], width / about.slope[0]);
-  const focal = wanted.has("camera") ? whole : Math.max(whole, height / 2);
+  // The whole of a camera's image fits into the window. Where it would be a strip, as on a phone held upright, it is
+  // enlarged half of the way, by ratios, to where it would leave nothing empty.
+  const fits = [height / about.slope[1], width / about.slope[0]], whole = Math.min(...fits);
+  const focal = wanted.has("camera") || fits[0] < fits[1] ? whole : Math.sqrt(fits[0] * fits[1]);
   return [focal, focal, width / 2 + focal * about.shift[0], height / 2 + focal * about.shift[1]];
 }
 
@@ -133,7 +133,7 @@ function addButtons() {
   };
   for (const b of document.querySelectorAll("[data-mode]")) b.onclick = () => { state.mode = b.dataset.mode; press(); };
   for (const b of document.querySelectorAll("[data-move]")) b.onclick = () => { state.move = b.dataset.move; press(); };
-  find("fold").onclick = () => find("panel").classList.toggle("folded");
+  find("fold").onclick = () => { find("panel").classList.toggle("folded"); again(); };
   find("reset").onclick = () => { state.playing = 0; reset(); press(); };
   find("path").onchange = () => { state.showPath = find("path").checked; again(); };
   find("play").hidden = about.cameras.length < 2;
