@@ -69,7 +69,7 @@ def small_looks(views: Sequence[View]) -> Array:
 
 def close(
     pairs: Iterable[tuple[int, int]], ids: Sequence[int], poses: Array, view_of: Callable[[int], View],
-    gaussians: Gaussians, classes: int, unit: float, seed: int,
+    gaussians: Gaussians, classes: int, unit: float,
 ) -> list[LoopEdge]:  # fmt: skip
     """Find the loops: the second frame of a pair is tracked by (16) by what was mapped around the first, from its pose.
 
@@ -79,8 +79,8 @@ def close(
         around = np.abs(np.searchsorted(ids, gaussians.anchors.numpy()) - i) <= GAP // 2
         near = Gaussians.of(gaussians.map.only(torch.from_numpy(around)))
         start = torch.from_numpy(poses[i])
-        own = track(near, view_of(i), [start], classes, unit, seed)
-        found = track(near, view_of(j), [start, torch.from_numpy(poses[j])], classes, unit, seed)
+        own = track(near, view_of(i), [start], classes, unit)
+        found = track(near, view_of(j), [start, torch.from_numpy(poses[j])], classes, unit)
         if found.covered > _MIN_COVERED and found.loss < _MAX_LOSS * own.loss:
             motion = found.cam_from_world.numpy() @ se3.inverse(poses[i])
             loops.append(LoopEdge(int(ids[i]), int(ids[j]), motion, 1.0, int(found.covered * 1000)))

@@ -69,18 +69,18 @@ class Samples:
     log_depth: NDArray[np.float32]
 
 
-def sample(view: View, classes: int, constants: Constants = PAPER) -> Samples:
-    """Take pixels on edges, spread evenly over a view, where its depth is not unreliable."""
+def sample(view: View, classes: int, constants: Constants = PAPER, cell: int = CELL) -> Samples:
+    """Take pixels on edges, spread evenly over a view, where its depth is not unreliable: one of cell x cell."""
     depth, trust, image = view.depth.numpy(), view.trust.numpy(), _planes(view, classes)
     known = (depth > 0) & (trust > constants.tau_low)
     if view.scene is not None:
         known &= view.scene.numpy()
     down, right = np.gradient(image[..., :3].mean(-1))
     strength = np.where(known, np.hypot(down, right) + 1e-3, 0)
-    h, w = (n // CELL for n in strength.shape)
-    cells = strength[: h * CELL, : w * CELL].reshape(h, CELL, w, CELL).swapaxes(1, 2).reshape(h * w, CELL * CELL)
-    best, cell = cells.argmax(1), np.flatnonzero(cells.max(1) > 0)
-    row, column = cell // w * CELL + best[cell] // CELL, cell % w * CELL + best[cell] % CELL
+    h, w = (n // cell for n in strength.shape)
+    cells = strength[: h * cell, : w * cell].reshape(h, cell, w, cell).swapaxes(1, 2).reshape(h * w, cell * cell)
+    best, at = cells.argmax(1), np.flatnonzero(cells.max(1) > 0)
+    row, column = at // w * cell + best[at] // cell, at % w * cell + best[at] % cell
     xy, camera = np.stack([column + 0.5, row + 0.5], 1), view.intrinsics
     return Samples(
         camera, unproject(xy, np.ones(len(xy)), camera), depth[row, column].astype(np.float64),

@@ -63,8 +63,7 @@ class Slam:
                 self._begin(view, constants)
                 self._optimise(view_of, FIRST_STEPS, [view.frame_id], constants)
             return
-        seed = self.seed + view.frame_id
-        found = track(self.gaussians, self._scaled(view), self._starts(), self.classes, self.unit, seed, constants)
+        found = track(self.gaussians, self._scaled(view), self._starts(), self.classes, self.unit, constants)
         if found.covered < _COVERED:
             self.lost[view.frame_id] = "the map covers too little of it"
             return

@@ -223,10 +223,10 @@ def _loops(
     if kept is not None:
         return len(pairs), kept
     poses = trajectory.cam_from_world[trajectory.is_keyframe]
-    unit, seed = scene_depth(recording, ids, fields), context.config.run.seed
+    unit = scene_depth(recording, ids, fields)
     found = close(
         context.progress.track(pairs, "loops", len(pairs)), ids, poses, lambda n: recording.scaled(ids[n], fields),
-        Gaussians.of(gaussian_map), len(recording.class_ids), unit, seed,
+        Gaussians.of(gaussian_map), len(recording.class_ids), unit,
     )  # fmt: skip
     LOOPS.save(context.snapshot, found)
     return len(pairs), found

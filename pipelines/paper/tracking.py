@@ -1,30 +1,27 @@
 """The pose of a frame from the map alone (section 3.3)."""
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from ..compute.adam import AdamTable
+from ..depth.fields import FINE
 from ..geometry import se3
 from ..mapping.views import View, halved
-from ..render.api import Rendering, moved
+from ..render.api import Rendering
+from ..types import VOID
 from .constants import PAPER, Constants
 from .gaussians import Gaussians, semantic_image, show
+from .rerender import CELL, Rerendering, Samples, sample
 
-LEVELS, SMALLEST = 3, 60
-"""Sizes that a frame is compared at, each half the next, down to this width: frames of ten pictures a second move by 30
-pixels, and of still smaller images the best pose is a wrong one."""
-_RATES = ((0.06, 0.004), (0.1, 0.01), (0.15, 0.03))
-"""First and last rate on each, the whole size first: in coordinates in which the loss is about half the square of the
-distance. The paper's 3e-3, of a twist, is the same for all six numbers."""
-_DIFFERENCE, _FLOOR = 2e-3, 0.02
-"""Of twists for differences, in radians and scene depths; and the smallest residual that is divided by."""
-_ROUNDS = (1, 2, 4)
-"""Of the paper's number of steps on each size, the whole first; (25) goes on from there."""
-_PATIENCE = 6
-"""Steps without a lower loss after which a size is done."""
+SMALLEST, LEVELS = 60, 4
+"""Sizes that a frame is compared at, each half the next, at most so many and down to this width: frames of ten pictures
+a second move by 50 pixels."""
+_FEWER = (0, 2, 3, 4)
+"""Taken from the width of `CELL`, the whole size first: of small images more of the pixels are drawn."""
+_MIN_SEEN = 0.1
+"""Share of a frame that has to be covered for a start to be compared with others."""
 
 
 @dataclass(frozen=True)
@@ -55,99 +52,74 @@ def tracking_loss(shown: Rendering, view: View, semantics: Tensor, unit: float, 
     return (view.of_scene(terms) * inside).sum() / inside.sum().clamp(min=1)
 
 
+@torch.no_grad()
 def track(
-    gaussians: Gaussians, view: View, starts: list[Tensor], classes: int, unit: float, seed: int,
-    constants: Constants = PAPER,
+    gaussians: Gaussians, view: View, starts: list[Tensor], classes: int, unit: float, constants: Constants = PAPER
 ) -> Tracked:  # fmt: skip
-    """Minimise (16) by Adam from the best of the starts (4, 4), on images of growing size.
+    """Minimise (16) from the best of the starts (4, 4), on images of growing size.
 
-    Smaller images see fewer and larger Gaussians: one in four at half the size, of twice the radius.
+    The map is drawn at the pose so far, and what it shows there is moved into the frame by steps of Gauss and Newton
+    (`rerender`), with the frame's scale field for a further unknown; then it is drawn anew. The paper's descent by Adam
+    draws the map at each step, and between pictures that turn by ten degrees it ends elsewhere: a turn looks much like
+    a shift, and the loss falls along both.
     """
-    views = [view]
-    while len(views) < LEVELS and views[-1].intrinsics.width >= 2 * SMALLEST:
-        views.append(halved(views[-1]))
-    problems = [_Problem(gaussians, v, starts, classes, unit, level, seed, constants) for level, v in enumerate(views)]
-    pose = min(starts, key=lambda start: problems[-1].loss(start))
-    for level in reversed(range(len(views))):
-        pose, loss = _converge(problems[level], pose, constants.track_iterations, level)
-    with torch.no_grad():
-        shown = problems[0].show(pose, None)
+    weights = replace(
+        constants, map_depth=constants.track_depth, map_color=constants.track_color, xi=constants.track_semantic
+    )
+    problem = _Problem(gaussians, view, classes, unit, weights)
+    top = len(problem.frame) - 1
+    found = [problem.moved(start, range(top, max(top - 2, -1), -1)) for start in starts]
+    pose, _ = min(found, key=lambda pair: pair[1])
+    for level in range(top - 1, 0, -1):
+        pose, _ = problem.moved(pose, (level, level - 1))
+    shown = show(problem.seen_from(pose), pose, view)
+    loss = float(tracking_loss(shown, view, semantic_image(view, classes), unit, constants))
     return Tracked(pose, loss, float((shown.silhouette > constants.t_sil).float().mean()))
 
 
 class _Problem:
-    """The Gaussians around the starts, thinned for a size, and what they are compared with."""
+    """A frame at all sizes, and the map that is moved into it."""
 
-    def __init__(
-        self, gaussians: Gaussians, view: View, starts: list[Tensor], classes: int, unit: float, level: int, seed: int,
-        constants: Constants,
-    ) -> None:  # fmt: skip
-        seen = [gaussians.in_view(start, view.intrinsics) for start in starts]
-        rows = torch.unique(torch.cat(seen))
-        picked = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[: -(-len(rows) // 4**level)]
-        rows = rows[picked.sort().values]
-        self.values = {k: v.detach()[rows] for k, v in gaussians.table.values.items()}
-        self.values["log_radii"] = self.values["log_radii"] + level * math.log(2)
-        self.view, self.unit, self.constants = view, unit, constants
-        self.semantics = semantic_image(view, classes)
+    def __init__(self, gaussians: Gaussians, view: View, classes: int, unit: float, weights: Constants) -> None:
+        self.gaussians, self.view, self.classes, self.unit, self.weights = gaussians, view, classes, unit, weights
+        self.frame = self._sizes(view)
 
-    def show(self, pose: Tensor, twist: Tensor | None) -> Rendering:
-        return show(self.values, pose, self.view, twist)
+    def seen_from(self, pose: Tensor) -> dict[str, Tensor]:
+        rows = self.gaussians.in_view(pose, self.view.intrinsics)
+        return {k: v.detach()[rows] for k, v in self.gaussians.table.values.items()}
 
-    def of(self, pose: Tensor, twist: Tensor | None) -> Tensor:
-        shown = self.show(pose, twist)
-        seen = (shown.silhouette.detach() > self.constants.t_sil).float().mean()
-        loss = tracking_loss(shown, self.view, self.semantics, self.unit, self.constants)
-        return loss if seen > 0.1 else loss + 10  # nothing to compare is no good pose
+    def moved(self, start: Tensor, levels: range | tuple[int, int]) -> tuple[Tensor, float]:
+        """The pose after steps on these sizes with what the map shows at the start, and the cost of the last."""
+        shown = show(self.seen_from(start), start, self.view)
+        inside = shown.silhouette > self.weights.t_sil
+        if float(inside.float().mean()) < _MIN_SEEN:
+            return start, np.inf
+        drawn, frame, weights = self._sizes(self._as_view(shown, inside)), self.frame, self.weights
+        if not bool((self.view.depth > 0).any()):  # what lies before what is not known: colours alone decide
+            weights = replace(weights, map_depth=0.0)
+            frame = [replace(f, log_depth=d.log_depth) for f, d in zip(frame, drawn, strict=True)]
+        poses, fields, cost = np.stack([start.numpy()] * 2), np.zeros((2, FINE.size)), np.inf
+        for level in levels:
+            free = np.array([False, True])
+            pair = [drawn[level], frame[level]]
+            problem = Rerendering(pair, poses, fields, free, free, [(0, 1)], self.unit, poses, weights)
+            problem = problem.minimised(self.weights.track_iterations // 2)
+            poses, cost = problem.poses, problem.cost()
+        return torch.from_numpy(poses[1]), cost
 
-    @torch.no_grad()
-    def basis(self, pose: Tensor) -> Tensor:
-        """(6, 6) twists along which the loss is equally curved: a turn looks much like a shift, and Adam, which knows
-        the axes alone, would stay in the valley between them."""
-        scales = torch.tensor([self.unit] * 3 + [1.0] * 3) * _DIFFERENCE
-        here = self._residuals(pose)
-        columns = [(self._residuals(moved(pose, row)) - here) / scales[i] for i, row in enumerate(torch.diag(scales))]
-        jacobian = torch.stack(columns).double()
-        weights = 1 / here.abs().clamp(min=_FLOOR).double()
-        normal = (jacobian * weights) @ jacobian.T / len(here)
-        normal = normal + torch.diag(1e-3 * normal.diagonal() + 1e-9)
-        return torch.linalg.inv(torch.linalg.cholesky(normal)).T.float()
+    def _as_view(self, shown: Rendering, inside: Tensor) -> View:
+        """What the map shows, as if it had been seen there."""
+        labels = torch.full_like(self.view.channels, VOID)
+        if self.classes:
+            labels = torch.where(inside, shown.features[..., 3:].argmax(-1).to(torch.uint8), labels)
+        return replace(
+            self.view, image=(shown.features[..., :3].clamp(0, 1) * 255).round().to(torch.uint8), channels=labels,
+            depth=torch.where(inside, shown.depth, torch.zeros(())), reliability=inside.to(torch.uint8) * 255,
+            scene=None,
+        )  # fmt: skip
 
-    def _residuals(self, pose: Tensor) -> Tensor:
-        """(4 H W,) colours and depths of (16), each by its weight, where the map is seen."""
-        shown, c = self.show(pose, None), self.constants
-        inside = (shown.silhouette > c.t_sil).float()
-        depth = c.track_depth * self.view.trust * (shown.depth - self.view.depth) / self.unit
-        color = c.track_color / 3 * (shown.features[..., :3] - self.view.colors)
-        return (self.view.of_scene(torch.cat([color, depth[..., None]], -1)) * inside[..., None]).reshape(-1)
-
-    @torch.no_grad()
-    def loss(self, pose: Tensor) -> float:
-        return float(self.of(pose, None))
-
-
-def _converge(problem: _Problem, pose: Tensor, steps: int, level: int) -> tuple[Tensor, float]:
-    """Rounds of the paper's number of steps, as long as one lowers the loss by a fiftieth."""
-    loss = math.inf
-    for _ in range(_ROUNDS[level]):
-        before = loss
-        pose, loss = _descend(problem, pose, steps, _RATES[level])
-        if loss > 0.98 * before:
-            break
-    return pose, loss
-
-
-def _descend(problem: _Problem, start: Tensor, steps: int, rates: tuple[float, float]) -> tuple[Tensor, float]:
-    """Adam in the coordinates of `basis`, its rate falling from the first to the last; the best pose seen, its loss."""
-    basis = problem.basis(start)
-    table, best, waited = AdamTable({"y": torch.zeros(6)}), (start, math.inf), 0
-    for step in range(steps):
-        twist = basis @ table.values["y"]
-        loss = problem.of(start, twist)
-        if float(loss.detach()) < best[1]:
-            best, waited = (moved(start, twist.detach().double()), float(loss.detach())), 0
-        elif (waited := waited + 1) > _PATIENCE:
-            break
-        (gradient,) = torch.autograd.grad(loss, table.values["y"])
-        table.step({"y": gradient}, {"y": rates[0] * (rates[1] / rates[0]) ** (step / max(steps - 1, 1))})
-    return best
+    def _sizes(self, view: View) -> list[Samples]:
+        views = [view]
+        while len(views) < LEVELS and views[-1].intrinsics.width >= 2 * SMALLEST:
+            views.append(halved(views[-1]))
+        return [sample(v, self.classes, self.weights, CELL - fewer) for v, fewer in zip(views, _FEWER, strict=False)]

@@ -270,12 +270,12 @@ def test_16_finds_a_pose_again() -> None:
             (there - rendering.projection(points, torch.ones(25), identity, view.intrinsics)[0]).norm(dim=1).mean()
         )
 
-    found = tracking.track(gaussians, view, [start], 2, 2.0, 0)
+    found = tracking.track(gaussians, view, [start], 2, 2.0)
     assert 0 < pixels_off(found.cam_from_world) < 0.5
     assert pixels_off(start) > 2
     assert found.covered > 0.9
-    assert (found.cam_from_world == tracking.track(gaussians, view, [start], 2, 2.0, 0).cam_from_world).all()
-    assert pixels_off(tracking.track(gaussians, view, [start, identity], 2, 2.0, 0).cam_from_world) < 0.5
+    assert (found.cam_from_world == tracking.track(gaussians, view, [start], 2, 2.0).cam_from_world).all()
+    assert pixels_off(tracking.track(gaussians, view, [start, identity], 2, 2.0).cam_from_world) < 0.5
 
 
 # (17) to (20) ---------------------------------------------------------------------------------------------------
