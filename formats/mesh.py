@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from .atomic import write_text
 from .errors import InputError
-from .glb import UNLIT, Part, linear, material, write_primitive
-from .images import jpeg_bytes, write_rgb
+from .glb import UNLIT, Part, glb_parts, linear, material, write_primitive
+from .images import decode_rgb, jpeg_bytes, write_rgb
 from .ply import Rows, columns, read_ply, read_rows, write_ply
-from .reading import parsing
+from .reading import parsing, read_bytes
 from .trajectory import FARTHEST
 
 _LINEAR, _MIPMAPPED, _CLAMPED = 9729, 9987, 33071
@@ -238,3 +238,19 @@ def write_textured_glb(path: Path, mesh: TexturedMesh, class_names: tuple[str, .
     }
     picture = jpeg_bytes(mesh.texture)
     write_primitive(path, parts, {"material": 0}, class_names, {"name": "mesh"}, extras, [UNLIT], picture)
+
+
+def read_textured_glb(path: Path) -> TexturedMesh | None:
+    """Read a mesh by `write_textured_glb`, every corner a vertex of its own; None where it has no texture, as those by
+    `write_mesh_glb`. Raises InputError for another file."""
+    data = read_bytes(path)
+    with parsing(path, "mesh", "export it again"):
+        document, binary = glb_parts(data)
+        if "textures" not in document:
+            return None
+        parts = [binary[v["byteOffset"] : v["byteOffset"] + v["byteLength"]] for v in document["bufferViews"]]
+        places, uv, labels = (np.frombuffer(part, "<f4") for part in parts[:3])
+        faces = np.frombuffer(parts[3], "<u4").reshape(-1, 3).astype(np.int32)
+        own = np.arange(len(labels))
+        picture = decode_rgb(parts[4], str(path))
+        return TexturedMesh(places.reshape(-1, 3), labels.astype(np.uint8), own, uv.reshape(-1, 2), faces, picture)

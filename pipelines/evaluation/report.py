@@ -1,6 +1,6 @@
 """One HTML file about a run that opens anywhere, without a network."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ...formats.atomic import write_text
 from ...formats.datasets.sequence import distortion_names
+from ...formats.mesh import read_textured_glb
 from ...formats.reading import read_bytes
 from ...formats.textfile import read_json
 from ..config import Config, config_to_dict
@@ -47,7 +48,7 @@ from .html import (
     table,
 )
 from .image_quality import psnr
-from .views import depth_picture, depth_range, labels_on_photo, render_outcome
+from .views import depth_picture, depth_range, labels_on_photo, mesh_picture, render_outcome
 from .write import PATH_FROM_ABOVE, TABLE_HEADER, evaluation_rows, trajectory_plots, unit_name
 
 MEASURED_VIEWS = 60
@@ -62,7 +63,7 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
 
     Raises InputError for a run without poses.
     """
-    outcome = load_outcome(run)
+    outcome, target = load_outcome(run), path or run.report_file
     sparse, loops = outcome.load_sparse(), run.load(LOOPS) if "global_ba" in outcome.records else []
     capture = read_capture(outcome, sparse)
     views = None if outcome.gaussian_map is None else render_views(outcome, progress or SilentProgress())
@@ -70,7 +71,9 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
     body = "".join(
         [
             _heading(outcome, loops),
+            _page_link(run, target),
             "" if views is None else section("What the map shows", views.sheet, class_legend(outcome, views)),
+            _mesh_section(outcome),
             _advice_section(outcome, capture, sparse, loops),
             _found_section(outcome, sparse, loops),
             _path_section(outcome),
@@ -82,7 +85,6 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
             _settings_section(outcome),
         ]
     )
-    target = path or run.report_file
     write_text(target, page(f"{run.root.name} – report", body))
     return target
 
@@ -115,6 +117,13 @@ def _heading(outcome: Outcome, loops: list[LoopEdge]) -> str:
     return f'<h1>{escape(outcome.run.root.name)}</h1><p class="sub">Source: {source}{after}</p>{chips(pairs)}'
 
 
+def _page_link(run: RunFolder, report: Path) -> str:
+    """The map's page, where the report lies beside the export."""
+    if report.resolve().parent != run.root.resolve() or not (run.stage("export") / WEB_PAGE).exists():
+        return ""
+    return f'<p><a href="export/{WEB_PAGE}">The map in one page</a>, to look at and to send.</p>'
+
+
 _AFTER = {
     "tracking": " (after tracking: no map yet)",
     "mapping": " (after mapping, before the global adjustment)",
@@ -128,6 +137,22 @@ def _advice_section(outcome: Outcome, capture: Capture, sparse: SparseModel | No
     if not lines:
         return section("What would improve it", "<p>No problem found in this capture.</p>", kind="fine")
     return section("What would improve it", bullets(lines), kind="advice")
+
+
+def _mesh_section(outcome: Outcome) -> str:
+    """The mesh with its texture from a few cameras of the path; nothing where there is none, or not as it was left."""
+    run, name = outcome.run, "mesh.glb"
+    if not run.has("export", name) or name in run.damaged("export") or (world := run.find(WORLD)) is None:
+        return ""
+    if (mesh := read_textured_glb(run.file("export", name))) is None:
+        return ""
+    t, camera = outcome.moved(world.exported_from_run).trajectory, outcome.calibration.intrinsics.at_most(_TILE_WIDTH)
+    mesh = replace(mesh, vertices=(mesh.vertices @ world.gltf_from_exported).astype(np.float32))
+    tiles = []
+    for row in spread_sample(np.flatnonzero(t.is_keyframe).tolist(), 4):
+        caption = f"mesh, {t.timestamps[row]:.2f} s"
+        tiles.append(f"<div>{image(mesh_picture(mesh, t.cam_from_world[row], camera), caption)}{caption}</div>")
+    return section("The mesh", f'<div class="grid">{"".join(tiles)}</div>')
 
 
 def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[LoopEdge]) -> str:
@@ -223,9 +248,7 @@ def _export_section(outcome: Outcome) -> str:
         return section("Files for other programs", "<p>Not exported yet.</p>")
     files = [row for row in files_of_export(outcome.run) if Path(row[0]).parts[0] not in (IMAGES, "masks")]
     notes = readme(outcome.run.find(WORLD) or FIRST, outcome.metres, outcome.metric)
-    page = outcome.run.stage("export") / WEB_PAGE
-    link = f'<p><a href="export/{WEB_PAGE}">The map in one page</a>, to look at and to send.</p>'
-    notes = f"{link if page.exists() else ''}<pre>{escape(notes)}</pre>"
+    notes = f"<pre>{escape(notes)}</pre>"
     return section("Files for other programs", notes, table(("in export/", "size"), files))
 
 

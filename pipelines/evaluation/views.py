@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...formats.gaussians import GaussianCloud
+from ...formats.mesh import TexturedMesh
+from ..compute.raster import draw_faces
 from ..outcome import Exposure, Outcome, labels_of_channels
 from ..providers import class_colors
 from ..render.api import render
@@ -23,7 +25,7 @@ from ..render.gaussian_map import GaussianMap, decided_channels
 from ..render.inspection import median_depth
 from ..render.reference import ALPHA_MAX, ALPHA_MIN, CUT_SIGMAS, TRANSMITTANCE_MIN
 from ..system.jit import kernel
-from ..types import VOID, ClassTable, Intrinsics
+from ..types import VOID, Array, ClassTable, Intrinsics
 
 _NEAR_SHARE = 0.01
 """Of the scene's size: what is nearer to the eye is not drawn."""
@@ -240,3 +242,16 @@ def _blend(table, colors, image, left):  # type: ignore[no-untyped-def]
                 for k in range(3):
                     image[row, column, k] += before * alpha * colors[g, k]
                 left[row, column] = before * (1 - alpha)
+
+
+def mesh_picture(mesh: TexturedMesh, cam_from_world: Array, camera: Intrinsics) -> Picture:
+    """Draw a mesh with its texture, four samples a pixel, on white; `cam_from_world` (4, 4) is from the mesh's axes."""
+    fine = camera.resized(2 * camera.width, 2 * camera.height)
+    faces = mesh.corner_vertex[mesh.faces].astype(np.int32)
+    drawn = draw_faces(mesh.vertices, faces, cam_from_world, fine)
+    seen, (height, width) = drawn.face >= 0, mesh.texture.shape[:2]
+    place = np.einsum("nk,nkc->nc", drawn.shares[seen], mesh.corner_uv[mesh.faces[drawn.face[seen]]])
+    texel = (place * (width, height)).astype(np.int64).clip(0, (width - 1, height - 1))
+    shown = np.full((*seen.shape, 3), 255, np.uint8)
+    shown[seen] = mesh.texture[texel[:, 1], texel[:, 0]]
+    return np.asarray(cv2.resize(shown, (camera.width, camera.height), interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,5 +1,6 @@
 """The report is whole, self-contained, escapes what it is given, and its advice follows the capture."""
 
+import base64
 import json
 import re
 import time
@@ -14,10 +15,13 @@ from finished import note_finished
 
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import decode_rgb
+from msgs_slam.formats.mesh import TexturedMesh, write_textured_glb
 from msgs_slam.pipelines.evaluation.facts import Capture, advice, found_lengths, lost_stretches
 from msgs_slam.pipelines.evaluation.html import Line, page, plot, section, table, ticks
 from msgs_slam.pipelines.evaluation.report import write_report
 from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, write_evaluation
+from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import TRAJECTORY
@@ -102,6 +106,34 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     assert re.findall(r'(?:src|href)="(?!data:)', html) == []
     assert re.findall(r"https?://(?!www\.w3\.org/2000/svg)", html) == []
     assert len(html) < 3_000_000
+
+
+def test_the_report_shows_the_mesh_and_links_the_page_beside_it(oracle_run: OracleRun, tmp_path: Path) -> None:
+    """A wall of one colour, in front of the first camera, in the exported axes and turned as glTF wants it."""
+    run = oracle_run()
+    world = World("up", "floor", True, Similarity(2.0, np.eye(3), np.array([1.0, 0, 0])))
+    export = run.stage("export")
+    export.mkdir(exist_ok=True)
+    WORLD.save(export, world)
+    t = load_outcome(run).trajectory
+    first = np.linalg.inv(t.cam_from_world[np.flatnonzero(t.is_keyframe)[0]])
+    corners = np.array([[-9, -9, 3], [9, -9, 3], [9, 9, 3], [-9, 9, 3.0]]) @ first[:3, :3].T + first[:3, 3]
+    corners = world.exported_from_run.apply(corners) @ world.gltf_from_exported.T
+    texture = np.full((8, 8, 3), (200, 30, 120), np.uint8)
+    wall = TexturedMesh(
+        corners.astype(np.float32), np.zeros(4, np.uint8), np.arange(4), np.zeros((4, 2), np.float32),
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32), texture,
+    )  # fmt: skip
+    write_textured_glb(export / "mesh.glb", wall)
+    (export / "map.html").write_text("<p>map</p>")
+    note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
+    html = write_report(run).read_text()
+    assert '<a href="export/map.html">' in html.partition("What the map shows")[0]
+    shown = html.partition(">The mesh<")[2].partition("data:image/jpeg;base64,")[2].partition('"')[0]
+    np.testing.assert_allclose(decode_rgb(base64.b64decode(shown), "").mean((0, 1)), (200, 30, 120), atol=4)
+    assert "export/map.html" not in write_report(run, tmp_path / "other.html").read_text()
+    (export / "mesh.glb").write_bytes(b"no mesh")
+    assert ">The mesh<" not in write_report(run).read_text()
 
 
 def test_report_of_a_run_without_a_map_and_with_lost_frames(oracle_run: OracleRun) -> None:
