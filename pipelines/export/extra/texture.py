@@ -57,13 +57,19 @@ def texels_wanted(vertices: NDArray[np.float32], faces: NDArray[np.int32], shots
 
 
 def paint_texture(atlas: Atlas, shots: Sequence[Shot], progress: Progress) -> NDArray[np.uint8]:
-    """(height, width, 3) RGB; what no view sees has its vertices' colours, what no face covers those beside it."""
+    """(height, width, 3) RGB; a face that no view sees has its vertices' colours, a part of one and what no face covers
+    those beside it."""
     owner = owners(atlas)
     total = np.zeros((atlas.height, atlas.width, 4), np.float32)
     for shot in progress.track(shots, "texture", len(shots)):
         _add(total, owner, atlas, shot)
-    base = (atlas.mesh.colors / np.float32(255))[atlas.corner_vertex]
-    _in_bands(atlas.height, lambda a, b: _finish(total[a:b], owner[a:b], a, atlas.corners, atlas.corner_faces, base))
+    base, is_painted = (
+        (atlas.mesh.colors / np.float32(255))[atlas.corner_vertex],
+        np.zeros(len(atlas.corner_faces), bool),
+    )
+    is_painted[owner[(owner >= 0) & (total[..., 3] > 0)]] = True
+    of_mesh = (atlas.corners, atlas.corner_faces, base, is_painted)
+    _in_bands(atlas.height, lambda a, b: _finish(total[a:b], owner[a:b], a, *of_mesh))
     return np.round(_filled(total)[..., :3].clip(0, 1) * 255).astype(np.uint8)
 
 
@@ -86,21 +92,18 @@ def _density(vertices: NDArray[np.float32], normals: NDArray[np.float64], shot: 
     return np.where(seen, (shot.camera.fx * towards / np.where(seen, z, 1)).clip(0), 0)
 
 
-def _seen(atlas: Atlas, shot: Shot) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
-    """(F,) the faces that a pixel of the photograph shows; (H, W) of it: depth of the mesh, and 0..1 how far from the
-    rim of what shows it a pixel lies, in units of `_FEATHER`. What the map knows in front of the mesh hides it, but no
-    step that the map has a few pixels beside the mesh's: painted by that, rims would have the colours of what is
-    behind them."""
+def _seen(atlas: Atlas, shot: Shot) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(H, W) of the photograph: depth of the mesh, and 0..1 how far from the rim of what shows it a pixel lies, in
+    units of `_FEATHER`. What the map knows in front of the mesh hides it, but no step that the map has a few pixels
+    beside the mesh's: painted by that, rims would have the colours of what is behind them."""
     view, camera = shot.depth_view, shot.camera
-    drawn = draw_faces(atlas.mesh.vertices, atlas.mesh.faces, view.cam_from_world, camera)
-    mesh, is_shown = drawn.depth, np.zeros(len(atlas.mesh.faces), bool)
-    is_shown[drawn.face[drawn.face >= 0]] = True
+    mesh = draw_faces(atlas.mesh.vertices, atlas.mesh.faces, view.cam_from_world, camera).depth
     known = np.where(view.trust > 0, view.depth, np.inf).astype(np.float32)
     shows = (mesh > 0) & (resample_nearest(known, camera.height, camera.width) > (1 - _HIDDEN) * mesh)
     if shot.hidden is not None:
         shows &= ~shot.hidden
     away = cv2.distanceTransform(np.pad(shows.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
-    return is_shown, mesh, np.minimum(away / (_FEATHER * camera.width), 1).astype(np.float32)
+    return mesh, np.minimum(away / (_FEATHER * camera.width), 1).astype(np.float32)
 
 
 def _in_bands(rows: int, task: Callable[[int, int], None]) -> None:
@@ -111,8 +114,10 @@ def _add(total: NDArray[np.float32], owner: NDArray[np.int32], atlas: Atlas, sho
     """Add what the shot shows at each texel, times its weight there."""
     pose, photo = shot.depth_view.cam_from_world, np.ascontiguousarray(shot.photo(), np.float32)
     in_cam = (atlas.mesh.vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])[atlas.corner_vertex]
-    of_mesh = (atlas.corners, atlas.corner_faces, in_cam)
     camera, seen = np.array(shot.camera.numbers, np.float64), _seen(atlas, shot)
+    x, y, z = (in_cam * [*camera[:2], 1] + in_cam[:, 2:] * [*camera[2:], 0]).T
+    beyond = np.stack([x < 0, x > shot.camera.width * z, y < 0, y > shot.camera.height * z, z <= 0])
+    of_mesh = (atlas.corners, atlas.corner_faces, in_cam, ~beyond[:, atlas.corner_faces].all(2).any(0))
     _in_bands(
         atlas.height,
         lambda a, b: _sample(total[a:b], owner[a:b], a, *of_mesh, photo, *seen, camera, shot.sharpness, POWER, _SAME),
@@ -132,7 +137,7 @@ def _shares(x, y, corners, a, b, c):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sample(total, owner, top, corners, faces, in_cam, photo, shown, depth, trust, camera, sharpness, power, same):  # type: ignore[no-untyped-def]
+def _sample(total, owner, top, corners, faces, in_cam, inside, photo, depth, trust, camera, sharpness, power, same):  # type: ignore[no-untyped-def]
     rows, columns = owner.shape
     height, width = depth.shape
     fx, fy, cx, cy = camera
@@ -140,7 +145,7 @@ def _sample(total, owner, top, corners, faces, in_cam, photo, shown, depth, trus
     for row in range(rows):
         for column in range(columns):
             f = owner[row, column]
-            if f < 0 or not shown[f]:
+            if f < 0 or not inside[f]:
                 continue
             a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
             if f != last:
@@ -172,14 +177,16 @@ def _sample(total, owner, top, corners, faces, in_cam, photo, shown, depth, trus
 
 
 @kernel
-def _finish(total, owner, top, corners, faces, base):  # type: ignore[no-untyped-def]
-    """Sums become colours with weight 1; where nothing was added, those of the vertices. Texels of no face stay 0."""
+def _finish(total, owner, top, corners, faces, base, is_painted):  # type: ignore[no-untyped-def]
+    """Sums become colours with weight 1; in faces to which nothing was added, those of the vertices. Others stay 0."""
     for row in range(owner.shape[0]):
         for column in range(owner.shape[1]):
             f = owner[row, column]
             if f < 0:
                 continue
             weight = total[row, column, 3]
+            if weight == 0 and is_painted[f]:
+                continue
             a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
             p, q, r = _shares(column + 0.5, row + top + 0.5, corners, a, b, c)
             for k in range(3):
