@@ -16,7 +16,7 @@ from .gaussians import Gaussians, semantic_image, show
 from .rerender import CELL, Rerendering, Samples, sample
 
 SMALLEST, LEVELS = 60, 4
-"""Sizes that a frame is compared at, each half the next, at most so many and down to this width: frames of ten pictures
+"""Sizes that a frame is compared at, each half the next, at most so many and down to this width: frames of ten images
 a second move by 50 pixels."""
 _FEWER = (0, 2, 3, 4)
 """Taken from the width of `CELL`, the whole size first: of small images more of the pixels are drawn."""
@@ -60,7 +60,7 @@ def track(
 
     The map is drawn at the pose so far, and what it shows there is moved into the frame by steps of Gauss and Newton
     (`rerender`), with the frame's scale field for a further unknown; then it is drawn anew. The paper's descent by Adam
-    draws the map at each step, and between pictures that turn by ten degrees it ends elsewhere: a turn looks much like
+    draws the map at each step, and between images that turn by ten degrees it ends elsewhere: a turn looks much like
     a shift, and the loss falls along both.
     """
     weights = replace(
