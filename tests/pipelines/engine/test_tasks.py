@@ -1,4 +1,4 @@
-"""Processes that share the tasks of a run over its folder: each task once, whoever is killed, in any order."""
+"""Processes share the tasks of a run over its folder: each once, whoever is killed, in any order; their threads."""
 
 import platform
 import resource
@@ -13,16 +13,21 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import cv2
 import engine_calls
 import pytest
+import torch
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from msgs_slam.formats import atomic
 from msgs_slam.formats.errors import InputError, RecoverableError
+from msgs_slam.pipelines.compute.threads import get_threads
+from msgs_slam.pipelines.compute.threads import set_threads as set_render_threads
 from msgs_slam.pipelines.config import STAGES, Config
 from msgs_slam.pipelines.engine import tasks
 from msgs_slam.pipelines.engine.runner import run_stages
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
-from msgs_slam.pipelines.engine.tasks import Shard, SharedWorkers, TaskBoard, boards_in, in_chunks
+from msgs_slam.pipelines.engine.tasks import Shard, SharedWorkers, TaskBoard, boards_in, in_chunks, set_threads
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.system.values import load_value
@@ -236,3 +241,23 @@ def test_a_folder_that_a_node_does_not_see_is_named(folder: Path, monkeypatch: p
     folder.rmdir()
     with pytest.raises(RecoverableError, match=f"halve 1: the node node-7 does not see {folder}"):
         board.do_one(Shard(), engine_calls.silent)
+
+
+@pytest.fixture
+def threads_as_before() -> Iterator[None]:
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    with threadpool_limits():
+        yield
+    torch.set_num_threads(before[0])
+    cv2.setNumThreads(before[1])
+    set_render_threads(0)
+
+
+def test_libraries_take_the_threads_but_matrices_one(threads_as_before: None) -> None:
+    """A matrix product on another number of threads has other last digits: results would depend on the machine."""
+    threadpool_limits(2, "blas")
+    set_threads(3)
+    assert (torch.get_num_threads(), cv2.getNumThreads(), get_threads()) == (3, 3, 3)
+    found = [p["num_threads"] for p in threadpool_info() if p["user_api"] == "blas"]
+    assert found
+    assert set(found) == {1}

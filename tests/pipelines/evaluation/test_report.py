@@ -1,8 +1,10 @@
-"""The report is whole, self-contained, escapes what it is given, and its advice follows the capture."""
+"""The report is whole, self-contained, escapes what it is given, its advice follows the capture, and it is printed."""
 
 import base64
 import json
 import re
+import shutil
+import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,14 +13,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from finished import note_finished
 
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import decode_rgb
 from msgs_slam.formats.mesh import TexturedMesh, write_textured_glb
+from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.evaluation.facts import Capture, advice, found_lengths, lost_stretches
-from msgs_slam.pipelines.evaluation.html import Line, page, plot, section, table, ticks
+from msgs_slam.pipelines.evaluation.html import BROWSERS, Line, page, plot, print_pdf, section, table, ticks
 from msgs_slam.pipelines.evaluation.report import write_report
 from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, write_evaluation
 from msgs_slam.pipelines.geometry.se3 import Similarity
@@ -231,3 +235,33 @@ def test_on_a_phone_words_of_tables_stay_whole_and_nothing_scrolls_sideways(tmp_
         assert tab.value("document.documentElement.scrollWidth") == 390
         head = "document.querySelector('th:nth-child(2)')"
         assert tab.value(f"{head}.clientHeight") < 40  # seconds in one line, not a letter in each
+
+
+def test_without_a_browser_nothing_is_drawn(
+    oracle_run: Callable[..., RunFolder], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = oracle_run()
+    monkeypatch.setenv("PATH", str(tmp_path))
+    done = CliRunner().invoke(main, ["report", str(run.root), "--pdf"])
+    assert done.exit_code == 1
+    assert "install chromium" in done.output
+    assert not run.report_file.exists()
+
+
+@pytest.mark.skipif(not any(map(shutil.which, BROWSERS)), reason="no browser is installed here to print with")
+def test_a_page_becomes_a_pdf(tmp_path: Path) -> None:
+    (tmp_path / "page.html").write_text("<p>one</p><p style='break-before: page'>two</p>")
+    browser = next(found for name in BROWSERS if (found := shutil.which(name)))
+    print_pdf(tmp_path / "page.html", tmp_path / "page.pdf", browser)
+    assert (tmp_path / "page.pdf").read_bytes().startswith(b"%PDF-")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["page.html", "page.pdf"]
+
+
+def test_a_browser_that_fails_leaves_nothing(tmp_path: Path) -> None:
+    (tmp_path / "page.html").write_text("<p>one</p>")
+    false = shutil.which("false")
+    assert false is not None
+    assert subprocess.run([false]).returncode
+    with pytest.raises(InputError, match="could not print"):
+        print_pdf(tmp_path / "page.html", tmp_path / "page.pdf", false)
+    assert not (tmp_path / "page.pdf").exists()

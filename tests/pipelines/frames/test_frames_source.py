@@ -1,4 +1,4 @@
-"""Videos and folders of images as sources, the odd ones included."""
+"""Videos and folders of images as sources, the odd ones included, and what `frames` reports of their GPS."""
 
 import shutil
 from collections.abc import Callable
@@ -8,18 +8,19 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from PIL import Image
+from PIL import ExifTags, Image
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_grey_png, write_rgb
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.frames.stage import run
+from msgs_slam.pipelines.frames.stage import places_figure, run
 from msgs_slam.pipelines.reconstruct import one_source, source_digest
 from msgs_slam.pipelines.run.folder import RunFolder, load_source
 from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
 from msgs_slam.pipelines.source.opening import FolderSource, VideoSource, open_source
+from msgs_slam.pipelines.types import Frame
 
 
 def _shade(value: int, width: int = 64, height: int = 48) -> np.ndarray:
@@ -243,3 +244,22 @@ def test_pointers_in_place_of_images_are_named(tmp_path: Path) -> None:
         (tmp_path / f"{i}.JPG").write_text("version https://git-lfs.github.com/spec/v1\n")
     with pytest.raises(InputError, match=r"none of the 3 images.*0\.JPG is a git-LFS pointer"):
         open_source(tmp_path)
+
+
+def write_photos(folder: Path, placed: int, count: int) -> Path:
+    """Pictures of which the first `placed` say where they were taken."""
+    folder.mkdir()
+    for i in range(count):
+        image = Image.fromarray(np.full((48, 64, 3), 30 * i, np.uint8))
+        exif = Image.Exif()
+        if i < placed:
+            exif[ExifTags.Base.GPSInfo] = {1: "N", 2: (55.0, 41.0, 0.1 * i), 3: "E", 4: (13.0, 11.0, 0.0)}
+        image.save(folder / f"{i}.jpg", exif=exif)
+    return folder
+
+
+def test_how_many_pictures_say_where_they_were_taken(tmp_path: Path) -> None:
+    frames = [Frame(i, f"{i}.jpg", float(i), i, 1.0) for i in range(4)]
+    some, none = (open_source(write_photos(tmp_path / str(n), n, 4), "auto") for n in (3, 0))
+    assert places_figure(some, frames) == {"gps": "of 3 of 4 images"}
+    assert places_figure(none, frames) == {}

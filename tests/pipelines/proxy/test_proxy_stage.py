@@ -1,5 +1,6 @@
-"""The stage from frames to maps: contents, resuming, and what it says of itself."""
+"""The stage from frames to maps: contents, resuming, the same bytes by workers, and what it says of itself."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from proxy_room import UNIT, Room
+from tiny_tflite import write_tflite
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
@@ -21,6 +23,7 @@ from msgs_slam.pipelines.proxy.stage import run
 from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, DESCRIPTORS, PROXY_MAPS
 from msgs_slam.pipelines.types import VOID, Frame
 from tests.killed import KillAt, Killed
+from tests.pipelines.travelling import Travelling
 
 Make = Callable[..., StageContext]
 FILES = ("proxy.depth=files", "proxy.semantics=files")
@@ -181,3 +184,35 @@ def test_a_network_that_sees_another_camera_is_told(
     CALIBRATION.save(context.run.stage("frames"), replace(room.calibration, origin=origin, focal_sd=3.0))
     run(context)
     assert any("focal length of" in w for w in context.warnings) == doubted
+
+
+KINDS = {"look_for_depth", "make_depths", "look_for_moving", "look_for_labels", "make_maps"}
+
+
+def card(folder: Path) -> str:
+    """A network that calls bright, red and blue things by three names."""
+    folder.mkdir()
+    write_tflite(folder / "net.tflite", [[8.0, 8, 8], [8, -8, -8], [-8, -8, 8]], [0, 2, 2], "argmax", (24, 32))
+    values = {
+        "task": "segmentation", "model": "net.tflite", "input": "image", "output": "scores", "kind": "logits",
+        "white": 1.0, "mean": [0.5] * 3, "std": [0.5] * 3, "classes": ["bright", "red", "blue"],
+    }  # fmt: skip
+    (folder / "card.toml").write_text("".join(f"{k} = {json.dumps(v)}\n" for k, v in values.items()))
+    return f"onnx:{folder / 'card.toml'}"
+
+
+@pytest.mark.parametrize("given", ["embedded", "fused"])
+def test_workers_leave_the_same_bytes(
+    room: Room, make_context: Callable[..., StageContext], tmp_path: Path, given: str
+) -> None:
+    """Whatever depends on all frames (scales, what the scene holds) must reach who works on some of them."""
+    settings: tuple[str, ...] = ("proxy.stereo_side=64", "proxy.stereo_planes=16", "run.cache_mb=0")
+    if given == "fused":
+        settings += ("proxy.depth=files", "proxy.fuse=always", f"proxy.semantics={card(tmp_path / 'network')}")
+    whole, divided = make_context(*settings), make_context(*settings, name="divided")
+    workers = Travelling(tmp_path, 2)
+    object.__setattr__(divided, "source", whole.source)
+    object.__setattr__(divided, "workers", workers)
+    assert run(divided) == run(whole)
+    assert tree(divided.folder) == tree(whole.folder)
+    assert workers.done == dict.fromkeys(KINDS, 6)
