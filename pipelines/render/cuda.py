@@ -17,9 +17,11 @@ from .cuda_projection import project, record
 
 __all__ = ["composite", "composite_records", "depth_ratio", "inspect", "inspect_records", "list_tiles", "project"]
 
-STEP = 16
-TILE = 16
+STEP, STEP_BACK = 16, 8
+"""Gaussians at a time, forward and backward."""
+TILE = 8
 """Pixels along a tile."""
+_WARPS, _WARPS_BACK = 2, 1
 _BLOCK, _TILE_BLOCK = 1024, 256
 
 
@@ -91,7 +93,7 @@ class _Composite(torch.autograd.Function):
         size = (width, height, features.shape[1])
         gpu.launch(forward_tile, len(starts) - 1, *inputs, image, *planes, *size, **settings)
         ctx.save_for_backward(*inputs, image, *planes)
-        ctx.size, ctx.settings = size, settings
+        ctx.size = size
         ctx.set_materialize_grads(False)
         return (image, *planes)
 
@@ -105,8 +107,8 @@ class _Composite(torch.autograd.Function):
             for image, gradient in zip(images, gradients, strict=True)
         ]
         results = features.new_zeros(records.numel() + features.numel()).split([records.numel(), features.numel()])
-        given = (*results, *ctx.size)
-        gpu.launch(backward_tile, len(starts) - 1, *inputs, *images, *upstream, *given, **ctx.settings)
+        given = (*results, *ctx.size[:2])
+        gpu.launch(backward_tile, len(starts) - 1, *inputs, *images, *upstream, *given, **_back_settings(ctx.size[2]))
         return results[0].view_as(records), results[1].view_as(features), *[None] * 3
 
 
@@ -140,8 +142,14 @@ def _settings(channels: int) -> dict[str, Any]:
         "TILE": TILE,
         "ALPHA_MAX": reference.ALPHA_MAX,
         "LIGHT_MIN": reference.TRANSMITTANCE_MIN,
-        "num_warps": 8,
+        "num_warps": _WARPS,
     }
+
+
+def _back_settings(channels: int) -> dict[str, Any]:
+    """The same of the backward pass, which pads no channels."""
+    rest = {key: value for key, value in _settings(channels).items() if key != "PADDED"}
+    return rest | {"CHANNELS": channels, "STEP": STEP_BACK, "num_warps": _WARPS_BACK}
 
 
 def list_tiles(records: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:

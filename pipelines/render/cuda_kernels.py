@@ -1,9 +1,9 @@
-"""Triton kernels: one program per tile, its 256 pixels in lanes, sixteen Gaussians at a time as a matrix.
+"""Triton kernels: one program per tile, its pixels in registers, some Gaussians at a time in lanes, as a matrix.
 
-Within a step the light before each Gaussian is a running product along the matrix, and all sums over Gaussians or
-pixels are matrix products, on tensor cores with the digits of float32 ("tf32x3"). Gradients leave a tile with one
-atomic addition per Gaussian and value. The interpreter of Triton (environment variable TRITON_INTERPRET=1) runs these
-kernels on CPU tensors.
+Within a step the light before each Gaussian is a running product along the matrix. The forward pass blends by matrix
+products, on tensor cores with the digits of float32 ("tf32x3"). The backward pass has none: a tile is one warp's, so
+that its sums over pixels need no barrier. Gradients leave a tile with one atomic addition per Gaussian and value.
+The interpreter of Triton (environment variable TRITON_INTERPRET=1) runs these kernels on CPU tensors.
 """
 
 import triton
@@ -38,18 +38,19 @@ def opacities(
     dx = x[:, None] - u[None, :]
     dy = y[:, None] - v[None, :]
     distance2 = dx * dx + dy * dy
-    alpha = opacity[None, :] * tl.exp(-0.5 * distance2 / (sigma * sigma)[None, :])
+    alpha = opacity[None, :] * tl.exp(distance2 * (-0.5 / (sigma * sigma))[None, :])
     alpha = tl.where(distance2 <= (reach * reach)[None, :], tl.minimum(alpha, ALPHA_MAX), 0.0)
     return dx, dy, distance2, alpha
 
 
 @triton.jit
 def transmittance(light: tl.tensor, occlusion: tl.tensor, STEP: tl.constexpr) -> tl.tensor:
-    """(pixels, Gaussians) light that reaches each Gaussian, and (pixels,) what is left behind all of them."""
-    passed = tl.cumprod(1.0 - occlusion, axis=1)
+    """(pixels, Gaussians) light that reaches each Gaussian, (pixels,) what is left behind all of them, and (pixels,
+    Gaussians) the light before each Gaussian by that behind it."""
+    passed = light[:, None] * tl.cumprod(1.0 - occlusion, axis=1)
     last = tl.arange(0, STEP) == STEP - 1
-    after = light * tl.sum(tl.where(last[None, :], passed, 0.0), axis=1)
-    return light[:, None] * (passed / (1.0 - occlusion)), after
+    inverse = 1.0 / (1.0 - occlusion)
+    return passed * inverse, tl.sum(tl.where(last[None, :], passed, 0.0), axis=1), inverse
 
 
 @triton.jit
@@ -82,7 +83,7 @@ def forward_tile(
     while (first < end) & (tl.max(light, axis=0) >= LIGHT_MIN):
         index, used, u, v, sigma, z, opacity, reach = load_step(records, members, first, end, STEP)
         _, _, _, alpha = opacities(x, y, u, v, sigma, opacity, reach, ALPHA_MAX)
-        before, light = transmittance(light, alpha, STEP)
+        before, light, _ = transmittance(light, alpha, STEP)
         weight = tl.where(before >= LIGHT_MIN, alpha * before, 0.0)
         mask = used[:, None] & (channel < channels)[None, :]
         values = tl.load(features + index[:, None] * channels + channel[None, :], mask=mask, other=0.0)
@@ -102,54 +103,50 @@ def backward_tile(
     starts: tl.tensor, members: tl.tensor, records: tl.tensor, features: tl.tensor,
     image: tl.tensor, depth: tl.tensor, depth_seen: tl.tensor, seen: tl.tensor,
     d_image: tl.tensor, d_depth: tl.tensor, d_depth_seen: tl.tensor, d_seen: tl.tensor,
-    d_records: tl.tensor, d_features: tl.tensor,
-    width: tl.tensor, height: tl.tensor, channels: tl.tensor,
-    PADDED: tl.constexpr, STEP: tl.constexpr, TILE: tl.constexpr,
+    d_records: tl.tensor, d_features: tl.tensor, width: tl.tensor, height: tl.tensor,
+    CHANNELS: tl.constexpr, STEP: tl.constexpr, TILE: tl.constexpr,
     ALPHA_MAX: tl.constexpr, LIGHT_MIN: tl.constexpr,
 ) -> None:  # fmt: skip
     """Front to back once more; what is behind a Gaussian is the pixel's total minus what has been blended so far."""
     tile, pixel, inside, x, y = pixels_of_tile(width, height, TILE)
-    channel = tl.arange(0, PADDED)
-    mask = inside[:, None] & (channel < channels)[None, :]
-    at = pixel[:, None] * channels + channel[None, :]
-    pull = tl.load(d_image + at, mask=mask, other=0.0)
     pull_depth = tl.load(d_depth + pixel, mask=inside, other=0.0)
     pull_depth_seen = tl.load(d_depth_seen + pixel, mask=inside, other=0.0)
     pull_seen = tl.load(d_seen + pixel, mask=inside, other=0.0)
-    behind = tl.sum(pull * tl.load(image + at, mask=mask, other=0.0), axis=1)
-    behind += pull_seen * tl.load(seen + pixel, mask=inside, other=0.0)
-    depth_behind = pull_depth * tl.load(depth + pixel, mask=inside, other=0.0)
-    depth_behind += pull_depth_seen * tl.load(depth_seen + pixel, mask=inside, other=0.0)
+    behind = pull_seen * tl.load(seen + pixel, mask=inside, other=0.0)
+    behind += pull_depth * tl.load(depth + pixel, mask=inside, other=0.0)
+    behind += pull_depth_seen * tl.load(depth_seen + pixel, mask=inside, other=0.0)
+    pull_seen += pull_depth_seen
+    for c in range(CHANNELS):
+        pull = tl.load(d_image + pixel * CHANNELS + c, mask=inside, other=0.0)
+        behind += pull * tl.load(image + pixel * CHANNELS + c, mask=inside, other=0.0)
     light = tl.where(inside, 1.0, 0.0)
     first, end = tl.load(starts + tile), tl.load(starts + tile + 1)
     while (first < end) & (tl.max(light, axis=0) >= LIGHT_MIN):
-        index, used, u, v, sigma, z, opacity, reach = load_step(records, members, first, end, STEP)
+        index, _, u, v, sigma, z, opacity, reach = load_step(records, members, first, end, STEP)
         dx, dy, distance2, alpha = opacities(x, y, u, v, sigma, opacity, reach, ALPHA_MAX)
-        before, light = transmittance(light, alpha, STEP)
-        feature_mask = used[:, None] & (channel < channels)[None, :]
-        feature_at = index[:, None] * channels + channel[None, :]
-        values = tl.load(features + feature_at, mask=feature_mask, other=0.0)
-        q = tl.dot(pull, tl.trans(values), input_precision="tf32x3") + pull_seen[:, None]
-        depth_q = pull_depth[:, None] * z[None, :] + pull_depth_seen[:, None]
+        before, light, inverse = transmittance(light, alpha, STEP)
         live = before >= LIGHT_MIN
         weight = tl.where(live, alpha * before, 0.0)
-        left = depth_behind[:, None] - tl.cumsum(weight * depth_q, axis=1)
-        depth_behind -= tl.sum(weight * depth_q, axis=1)
-        d_alpha = before * depth_q - left / (1.0 - alpha)
-        d_z = tl.sum(weight * pull_depth[:, None], axis=0)
+        q = pull_depth[:, None] * z[None, :] + pull_seen[:, None]
+        # The pulls of pixels are read again, from the cache: kept, they would take the registers of the matrices.
+        for c in range(CHANNELS):
+            pull = tl.load(d_image + pixel * CHANNELS + c, mask=inside, other=0.0)
+            q += pull[:, None] * tl.load(features + index * CHANNELS + c)[None, :]
         left = behind[:, None] - tl.cumsum(weight * q, axis=1)
         behind -= tl.sum(weight * q, axis=1)
-        d_alpha += before * q - left / (1.0 - alpha)
-        m = tl.where(live & (alpha < ALPHA_MAX), d_alpha * alpha, 0.0)
+        m = tl.where(live & (alpha < ALPHA_MAX), (before * q - left * inverse) * alpha, 0.0)
+        touched = tl.max(weight, axis=0) > 0.0
         precision = 1.0 / (sigma * sigma)
         target = d_records + index * 6
-        tl.atomic_add(target, tl.sum(m * dx, axis=0) * precision, mask=used)
-        tl.atomic_add(target + 1, tl.sum(m * dy, axis=0) * precision, mask=used)
-        tl.atomic_add(target + 2, tl.sum(m * distance2, axis=0) * precision / sigma, mask=used)
-        tl.atomic_add(target + 3, d_z, mask=used)
-        tl.atomic_add(target + 4, tl.sum(m, axis=0) / tl.where(used, opacity, 1.0), mask=used)
-        of_features = tl.dot(tl.trans(weight), pull, input_precision="tf32x3")
-        tl.atomic_add(d_features + feature_at, of_features, mask=feature_mask)
+        tl.atomic_add(target, tl.sum(m * dx, axis=0) * precision, mask=touched, sem="relaxed")
+        tl.atomic_add(target + 1, tl.sum(m * dy, axis=0) * precision, mask=touched, sem="relaxed")
+        tl.atomic_add(target + 2, tl.sum(m * distance2, axis=0) * precision / sigma, mask=touched, sem="relaxed")
+        tl.atomic_add(target + 3, tl.sum(weight * pull_depth[:, None], axis=0), mask=touched, sem="relaxed")
+        tl.atomic_add(target + 4, tl.sum(m, axis=0) / tl.where(touched, opacity, 1.0), mask=touched, sem="relaxed")
+        for c in range(CHANNELS):
+            pull = tl.load(d_image + pixel * CHANNELS + c, mask=inside, other=0.0)
+            of_feature = tl.sum(weight * pull[:, None], axis=0)
+            tl.atomic_add(d_features + index * CHANNELS + c, of_feature, mask=touched, sem="relaxed")
         first += STEP
 
 
@@ -170,7 +167,7 @@ def inspect_tile(
     while (first < end) & (tl.max(light, axis=0) >= LIGHT_MIN):
         index, used, u, v, sigma, z, opacity, reach = load_step(records, members, first, end, STEP)
         _, _, _, alpha = opacities(x, y, u, v, sigma, opacity, reach, ALPHA_MAX)
-        before, light = transmittance(light, alpha, STEP)
+        before, light, _ = transmittance(light, alpha, STEP)
         weight = tl.where(before >= LIGHT_MIN, alpha * before, 0.0)
         crossing = (before >= 0.5) & (before - weight < 0.5)
         depth += tl.sum(tl.where(crossing, z[None, :], 0.0), axis=1)

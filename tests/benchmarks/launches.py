@@ -42,7 +42,7 @@ from msgs_slam.pipelines.mapping.optimise import MapOptimiser
 from msgs_slam.pipelines.mapping.schedule import Seeding, Step
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View, make_view
-from msgs_slam.pipelines.render import api, inspection
+from msgs_slam.pipelines.render import api, cuda, inspection
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 from tests import pretend_device
@@ -159,6 +159,8 @@ def as_on_a_card(patch: pytest.MonkeyPatch) -> None:
 
     patch.setattr(gpu, "supports_triton", lambda example: isinstance(example, PretendTensor))
     patch.setattr(gpu, "launch", partial(_launch, None))
+    for number in ("TILE", "STEP_BACK"):  # the interpreter takes as long for a small step as for a large one
+        patch.setattr(cuda, number, 16)
     for user in (api, inspection):
         patch.setattr(user, "choose_backend", backend)
 

@@ -32,6 +32,7 @@ from msgs_slam.pipelines.mapping.state import (  # noqa: E402
     OptimiserState,
 )
 from msgs_slam.pipelines.mapping.views import View  # noqa: E402
+from msgs_slam.pipelines.render import cuda  # noqa: E402
 from msgs_slam.pipelines.render.api import Rendering  # noqa: E402
 from msgs_slam.pipelines.types import VOID, Intrinsics  # noqa: E402
 from tests.card_builds import build  # noqa: E402
@@ -45,6 +46,9 @@ UNIT = 2.0
 def kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     """The interpreter takes the tensors of the CPU: float32 ones go to the kernels, as those of a card would."""
     monkeypatch.setattr(gpu, "supports_triton", lambda example: example.dtype == torch.float32)
+    if not ON_CARD:  # the interpreter takes as long for a small step as for a large one
+        monkeypatch.setattr(cuda, "TILE", 16)
+        monkeypatch.setattr(cuda, "STEP_BACK", 16)
 
 
 def made_view(size: tuple[int, int], classes: int, masked: bool, generator: torch.Generator) -> tuple[View, Tensor]:
