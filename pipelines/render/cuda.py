@@ -134,8 +134,8 @@ class _Ratio(torch.autograd.Function):
 
 
 def _settings(channels: int) -> dict[str, Any]:
-    """Compile-time numbers; matrix products want powers of two, at least 16."""
-    padded = max(16, 1 << (channels - 1).bit_length())
+    """Compile-time numbers; matrix products want powers of two, at least 16, and depth and silhouette are channels."""
+    padded = max(16, 1 << (channels + 1).bit_length())
     return {
         "PADDED": padded,
         "STEP": STEP,

@@ -72,13 +72,12 @@ def forward_tile(
     PADDED: tl.constexpr, STEP: tl.constexpr, TILE: tl.constexpr,
     ALPHA_MAX: tl.constexpr, LIGHT_MIN: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Blends the Gaussians of one tile and stores its four images."""
+    """Blends the Gaussians of one tile and stores its four images; depth and silhouette are two channels more."""
     tile, pixel, inside, x, y = pixels_of_tile(width, height, TILE)
     channel = tl.arange(0, PADDED)
+    of_depth, of_seen = (channel == channels)[None, :], (channel == channels + 1)[None, :]
     light = tl.where(inside, 1.0, 0.0)
     image = tl.zeros((TILE * TILE, PADDED), tl.float32)
-    depth = tl.zeros((TILE * TILE,), tl.float32)
-    seen = tl.zeros((TILE * TILE,), tl.float32)
     first, end = tl.load(starts + tile), tl.load(starts + tile + 1)
     while (first < end) & (tl.max(light, axis=0) >= LIGHT_MIN):
         index, used, u, v, sigma, z, opacity, reach = load_step(records, members, first, end, STEP)
@@ -87,15 +86,15 @@ def forward_tile(
         weight = tl.where(before >= LIGHT_MIN, alpha * before, 0.0)
         mask = used[:, None] & (channel < channels)[None, :]
         values = tl.load(features + index[:, None] * channels + channel[None, :], mask=mask, other=0.0)
+        values = tl.where(of_seen, 1.0, tl.where(of_depth, z[:, None], values))
         image += tl.dot(weight, values, input_precision="tf32x3")
-        depth += tl.sum(weight * z[None, :], axis=1)
-        seen += tl.sum(weight, axis=1)
         first += STEP
-    mask = inside[:, None] & (channel < channels)[None, :]
-    tl.store(out_features + pixel[:, None] * channels + channel[None, :], image, mask=mask)
-    tl.store(out_depth + pixel, depth, mask=inside)
-    tl.store(out_depth_seen + pixel, seen, mask=inside)
-    tl.store(out_seen + pixel, seen, mask=inside)
+    pixels, within = pixel[:, None] + 0 * channel[None, :], inside[:, None]
+    of_features = within & (channel < channels)[None, :]
+    tl.store(out_features + pixels * channels + channel[None, :], image, mask=of_features)
+    tl.store(out_depth + pixels, image, mask=within & of_depth)
+    tl.store(out_depth_seen + pixels, image, mask=within & of_seen)
+    tl.store(out_seen + pixels, image, mask=within & of_seen)
 
 
 @triton.jit
