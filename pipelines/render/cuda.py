@@ -17,7 +17,7 @@ from .cuda_projection import project, record
 
 __all__ = ["composite", "composite_records", "depth_ratio", "inspect", "inspect_records", "list_tiles", "project"]
 
-STEP, STEP_BACK = 16, 8
+STEP, STEP_BACK = 16, 4
 """Gaussians at a time, forward and backward."""
 TILE = 8
 """Pixels along a tile."""
