@@ -45,7 +45,6 @@ class Constants:
     track_depth: float = 0.8
     track_color: float = 1.0
     track_semantic: float = 0.3
-    track_rate: float = 3e-3
     track_iterations: int = 20
 
     # (17) to (20): mapping

@@ -1,15 +1,23 @@
-"""Label scores against scikit-learn, and after a known share of flips."""
+"""Label scores against scikit-learn and known flips; class maps join names that differ, and nonsense is refused."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.evaluation.labels import (
     count_labels,
     indices_by_name,
+    label_cells,
+    match_classes,
     matched_by_majority,
     matched_one_to_one,
+    open_class_map,
+    read_class_map,
     renamed,
     score,
+    shipped_maps,
 )
 from msgs_slam.pipelines.types import VOID
 
@@ -84,3 +92,90 @@ def test_names_find_each_other() -> None:
     assert found.tolist() == [1, 2, -1]
     assert indices_by_name(("segment 1",), ("wall",)) is None
     assert indices_by_name(("wall", "object1", "object2"), ("floor", "wall", "sofa")) is None
+
+
+THEIRS = ("couch", "stool", "wall", "shoe")
+ADE20K = ("wall", "floor", "ceiling", "sofa", "armchair", "table", "cabinet", "painting", "windowpane", "rug", "tree")
+WHITEROOM = ("wall", "floor", "woodwork", "sofa", "picture", "carpet", "tableware", "window")
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "mine.toml"
+    path.write_text(text)
+    return path
+
+
+def test_joined_names_are_one_class_and_the_others_are_left_out(tmp_path: Path) -> None:
+    given = read_class_map(write(tmp_path, '[classes]\nSofa = "couch"\nchair = ["couch", "Stool"]\nwall = "wall"\n'))
+    found = given.match(("wall", "sofa", "lamp"), ("wall", "sofa", "chair", "lamp"), THEIRS)
+    assert found.names == ("couch / stool", "wall")
+    assert found.of_ours.tolist() == [1, 0, -1]
+    assert found.of_truth.tolist() == [0, 0, 1, -1]
+    # Rows: couch, stool, wall, shoe; columns: wall, sofa, lamp, none.
+    confusion = np.array([[1, 5, 2, 0], [0, 3, 0, 4], [7, 1, 1, 1], [9, 9, 9, 9]])
+    assert found.joined(confusion).tolist() == [[8, 1, 6], [1, 7, 2]]
+    cells = label_cells(confusion, found, "onnx:net", THEIRS)
+    assert cells["matching"] == "by mine"
+    assert cells["class_recall"] == {"couch / stool": 8 / 15, "wall": 0.7}
+    assert cells["class_iou"] == {"couch / stool": 8 / 16, "wall": 7 / 11}
+
+
+def test_a_class_that_the_run_knows_and_did_not_find_counts(tmp_path: Path) -> None:
+    given = read_class_map(write(tmp_path, '[classes]\nwall = "wall"\nsofa = "couch"\nchair = "stool"\n'))
+    knows = given.match(("wall",), ("wall", "sofa"), THEIRS)
+    assert knows.names == ("couch", "wall")
+    cells = label_cells(np.array([[6, 0], [9, 9], [10, 0], [5, 5]]), knows, "onnx:net", THEIRS)
+    assert cells["class_iou"] == {"couch": 0.0, "wall": 10 / 16}
+    assert cells["mean_iou"] == pytest.approx(5 / 16)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('sofa = "couch"\n', r"\[classes\]"),
+        ("[classes]\nsofa = 3\n", "a name or a list of names"),
+        ("[classes]\nsofa = []\n", "a name or a list of names"),
+        ("[classes]\n[others]\n", "is not a class map"),
+        ("[classes\n", "mine.toml"),
+    ],
+)
+def test_what_is_no_class_map_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        read_class_map(write(tmp_path, text))
+
+
+def test_unknown_classes_are_refused_with_the_nearest(tmp_path: Path) -> None:
+    ours = read_class_map(write(tmp_path, '[classes]\nsofaa = "couch"\n'))
+    with pytest.raises(InputError, match=r"the run knows no class 'sofaa'; did you mean 'sofa'\?"):
+        ours.require_known(("sofa", "wall"), THEIRS)
+    theirs = read_class_map(write(tmp_path, '[classes]\nsofa = "coach"\n'))
+    with pytest.raises(InputError, match=r"the truth has no class 'coach'; did you mean 'couch'\?"):
+        theirs.require_known(("sofa", "wall"), THEIRS)
+    with pytest.raises(InputError, match="joins none"):
+        theirs.match(("sofa",), ("sofa",), THEIRS)
+    with pytest.raises(InputError, match="known: ade20k-replica"):
+        open_class_map("ade20k-mars")
+
+
+def test_the_map_that_fits_is_found_and_none_where_it_is_not_sure(caplog: pytest.LogCaptureFixture) -> None:
+    found = match_classes(("wall", "sofa", "object 1"), ADE20K, WHITEROOM, None)
+    assert found is not None
+    assert found.how == "by ade20k-whiteroom"
+    assert found.names == ("wall", "floor", "sofa", "picture", "carpet", "window")
+    assert found.of_ours.tolist() == [0, 2, -1]
+    # Regions without names have no vocabulary; names that are all the truth's need no map.
+    assert match_classes(("wall", "object 1", "object 2"), (), WHITEROOM, None) is None
+    same = match_classes(("wall", "sofa"), ADE20K, WHITEROOM, None)
+    assert same is not None
+    assert same.how == "by name"
+    # Replica's and ScanNet's names both hold these.
+    assert match_classes(("rug", "armchair", "wall"), ADE20K, ("wall", "table", "picture"), None) is None
+    assert "choose one with --class-map ade20k-replica or ade20k-scannet" in caplog.text
+
+
+def test_the_maps_that_come_with_the_program_are_sound() -> None:
+    maps = shipped_maps()
+    assert [m.name for m in maps] == ["ade20k-replica", "ade20k-scannet", "ade20k-whiteroom"]
+    for found in maps:
+        found.require_known((), found.truth)
+        assert {t for _, others in found.pairs for t in others} <= set(found.truth)
