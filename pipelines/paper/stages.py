@@ -62,7 +62,7 @@ _POINTS = 200
 
 SNAPSHOT_EVERY = 5
 """Frames between two snapshots."""
-MAP_PASSES, FINE_PASSES = 1, 4
+MAP_PASSES, FINE_PASSES = 1, 12
 """Visits of each keyframe: in `mapping`, and at full size once poses and depths are adjusted."""
 
 
