@@ -56,7 +56,8 @@ class GaussianMap:
     def only(self, rows: Tensor | slice) -> GaussianMap:
         """The Gaussians of rows (M,) bool, indices or a slice."""
         if isinstance(rows, Tensor) and rows.dtype == torch.int64:  # a third of the time of brackets
-            return GaussianMap(**{name: tensor.index_select(0, rows) for name, tensor in vars(self).items()})
+            there = rows.to(self.means.device)
+            return GaussianMap(**{name: tensor.index_select(0, there) for name, tensor in vars(self).items()})
         return GaussianMap(**{name: tensor[rows] for name, tensor in vars(self).items()})
 
     def to(self, device: str) -> GaussianMap:
