@@ -70,7 +70,7 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
     evaluation = read_json(run.evaluation_file) if run.evaluation_file.exists() else None
     body = "".join(
         [
-            _heading(outcome, loops),
+            _heading(outcome),
             _page_link(run, target),
             "" if views is None else section("What the map shows", views.sheet, class_legend(outcome, views)),
             _mesh_section(outcome),
@@ -104,13 +104,11 @@ def _figures(outcome: Outcome) -> list[tuple[str, str]]:
     return pairs
 
 
-def _heading(outcome: Outcome, loops: list[LoopEdge]) -> str:
-    pairs = [*_figures(outcome), ("focal length, px", f"{outcome.calibration.intrinsics.fx:.1f}")]
+def _heading(outcome: Outcome) -> str:
+    pairs = _figures(outcome)
     if pieces := outcome.pieces():
         apart = sum(int(p.trajectory.is_posed.sum()) for p in pieces)
         pairs.append((f"frames in {len(pieces)} further {'piece' if len(pieces) == 1 else 'pieces'}", str(apart)))
-    if "global_ba" in outcome.records:
-        pairs.append(("loops closed", str(len(loops))))
     pairs.append(("seconds", f"{sum(r.seconds for r in outcome.records.values()):.0f}"))
     source = escape(str(load_source(outcome.run).path))
     after = _AFTER.get(outcome.map_stage or outcome.pose_stage, "")
