@@ -34,13 +34,13 @@ _WIDE, _CUT = F32(1.001 * reference.ALPHA_MIN * math.exp(reference.CUT_SIGMAS**2
 
 
 @inner
-def first_pixel(low: np.float32) -> int:
+def first_pixel(low: np.float32) -> np.int32:
     """The first pixel whose centre is >= low; at least 0."""
     return np.int32(math.ceil(max(low - _HALF, _ZERO)))
 
 
 @inner
-def last_pixel(high: np.float32, size: int) -> int:
+def last_pixel(high: np.float32, size: int) -> np.int32:
     """The last pixel below `size` whose centre is <= high; -1 if there is none."""
     return np.int32(math.floor(max(min(high - _HALF, F32(size - 1)), -_ONE)))
 
