@@ -18,13 +18,6 @@ class FaceImage:
     shares: NDArray[np.float32]
     depth: NDArray[np.float32]
 
-    def blend(self, of_vertices: NDArray, faces: NDArray[np.int32]) -> NDArray[np.float32]:
-        """Interpolate (V, C) values of vertices: (H, W, C), 0 where there is no face."""
-        out = np.zeros((*self.face.shape, of_vertices.shape[1]), np.float32)
-        hit = self.face >= 0
-        out[hit] = np.einsum("nk,nkc->nc", self.shares[hit], of_vertices[faces[self.face[hit]]].astype(np.float32))
-        return out
-
 
 def draw_faces(vertices: NDArray, faces: NDArray[np.int32], cam_from_world: Array, camera: Intrinsics) -> FaceImage:
     """Draw triangles (F, 3) of vertices (V, 3) from a pose (4, 4), both of their sides; those that reach behind the
