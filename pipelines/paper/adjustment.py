@@ -26,7 +26,7 @@ from .rerender import Rerendering, Samples, sample
 Array = NDArray[np.float64]
 PARTNERS, NEAR = 6, 4
 """Keyframes that each is drawn into, of those that share enough with it: that many that share most, and others."""
-LOCAL_STEPS, GLOBAL_STEPS = (2, 2), (4, 6)
+LOCAL_STEPS, GLOBAL_STEPS = (2, 2), (10, 24)
 """At most, at half the size and at the whole."""
 _SHARED = 0.4
 
