@@ -13,7 +13,7 @@ from ..render.api import Rendering
 from ..types import VOID
 from .constants import PAPER, Constants
 from .gaussians import Gaussians, semantic_image, show
-from .rerender import CELL, Rerendering, Samples, sample
+from .rerender import CELL, SAME_SURFACE, SD_DEPTH, Rerendering, Samples, sample
 
 SMALLEST, LEVELS = 60, 4
 """Sizes that a frame is compared at, each half the next, at most so many and down to this width: frames of ten images
@@ -22,6 +22,8 @@ _FEWER = (0, 2, 3, 4)
 """Taken from the width of `CELL`, the whole size first: of small images more of the pixels are drawn."""
 _MIN_SEEN = 0.1
 """Share of a frame that has to be covered for a start to be compared with others."""
+_MISSED = float(np.log1p((SAME_SURFACE / SD_DEPTH) ** 2))
+"""Cost of what the map shows and the frame does not have there: a pose that brings nothing together is not the best."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,8 @@ class _Problem:
             pair = [drawn[level], frame[level]]
             problem = Rerendering(pair, poses, fields, free, free, [(0, 1)], self.unit, poses, weights)
             problem = problem.minimised(self.weights.track_iterations // 2)
-            poses, cost = problem.poses, problem.cost()
+            poses, share = problem.poses, len(problem.drawn(0, 1).rows) / max(len(pair[0].depth), 1)
+            cost = share * problem.cost() + (1 - share) * _MISSED
         return torch.from_numpy(poses[1]), cost
 
     def _as_view(self, shown: Rendering, inside: Tensor) -> View:

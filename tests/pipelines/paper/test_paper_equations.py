@@ -275,7 +275,9 @@ def test_16_finds_a_pose_again() -> None:
     assert pixels_off(start) > 2
     assert found.covered > 0.9
     assert (found.cam_from_world == tracking.track(gaussians, view, [start], 2, 2.0).cam_from_world).all()
-    assert pixels_off(tracking.track(gaussians, view, [start, identity], 2, 2.0).cam_from_world) < 0.5
+    nothing = se3.exp(torch.tensor([0, 0, 1.0, 0, 0, 0], dtype=torch.float64))  # all half as far again
+    for starts in ([start, identity], [start, nothing], [nothing, start]):
+        assert pixels_off(tracking.track(gaussians, view, starts, 2, 2.0).cam_from_world) < 0.5
 
 
 # (17) to (20) ---------------------------------------------------------------------------------------------------
