@@ -84,7 +84,7 @@ class _Problem:
 
     def __init__(self, gaussians: Gaussians, view: View, classes: int, unit: float, weights: Constants) -> None:
         self.gaussians, self.view, self.classes, self.unit, self.weights = gaussians, view, classes, unit, weights
-        self.frame = self._sizes(view)
+        self.frame = [self._sample(v, level) for level, v in enumerate(_sizes(view))]
 
     def seen_from(self, pose: Tensor) -> dict[str, Tensor]:
         rows = self.gaussians.in_view(pose, self.view.intrinsics)
@@ -96,19 +96,19 @@ class _Problem:
         inside = shown.silhouette > self.weights.t_sil
         if float(inside.float().mean()) < _MIN_SEEN:
             return start, np.inf
-        drawn, frame, weights = self._sizes(self._as_view(shown, inside)), self.frame, self.weights
-        if not bool((self.view.depth > 0).any()):  # what lies before what is not known: colours alone decide
+        views, weights = _sizes(self._as_view(shown, inside)), self.weights
+        is_blind = not bool((self.view.depth > 0).any())
+        if is_blind:  # what lies before what is not known: colours alone decide
             weights = replace(weights, map_depth=0.0)
-            frame = [replace(f, log_depth=d.log_depth) for f, d in zip(frame, drawn, strict=True)]
-        poses, fields, cost = np.stack([start.numpy()] * 2), np.zeros((2, FINE.size)), np.inf
+        poses, fields, free = np.stack([start.numpy()] * 2), np.zeros((2, FINE.size)), np.array([False, True])
         for level in levels:
-            free = np.array([False, True])
-            pair = [drawn[level], frame[level]]
-            problem = Rerendering(pair, poses, fields, free, free, [(0, 1)], self.unit, poses, weights)
+            drawn, frame = self._sample(views[level], level), self.frame[level]
+            frame = replace(frame, log_depth=drawn.log_depth) if is_blind else frame
+            problem = Rerendering([drawn, frame], poses, fields, free, free, [(0, 1)], self.unit, poses, weights)
             problem = problem.minimised(self.weights.track_iterations // 2)
-            poses, share = problem.poses, len(problem.drawn(0, 1).rows) / max(len(pair[0].depth), 1)
-            cost = share * problem.cost() + (1 - share) * _MISSED
-        return torch.from_numpy(poses[1]), cost
+            poses = problem.poses
+        share = len(problem.drawn(0, 1).rows) / max(len(drawn.depth), 1)
+        return torch.from_numpy(poses[1]), share * problem.cost() + (1 - share) * _MISSED
 
     def _as_view(self, shown: Rendering, inside: Tensor) -> View:
         """What the map shows, as if it had been seen there."""
@@ -121,8 +121,13 @@ class _Problem:
             scene=None,
         )  # fmt: skip
 
-    def _sizes(self, view: View) -> list[Samples]:
-        views = [view]
-        while len(views) < LEVELS and views[-1].intrinsics.width >= 2 * SMALLEST:
-            views.append(halved(views[-1]))
-        return [sample(v, self.classes, self.weights, CELL - fewer) for v, fewer in zip(views, _FEWER, strict=False)]
+    def _sample(self, view: View, level: int) -> Samples:
+        return sample(view, self.classes, self.weights, CELL - _FEWER[level])
+
+
+def _sizes(view: View) -> list[View]:
+    """The view at all sizes, the whole first."""
+    views = [view]
+    while len(views) < LEVELS and views[-1].intrinsics.width >= 2 * SMALLEST:
+        views.append(halved(views[-1]))
+    return views
