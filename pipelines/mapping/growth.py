@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -17,16 +16,12 @@ from torch import Tensor
 from ..config import MappingConfig
 from ..render.api import Rendering
 from ..render.gaussian_map import GaussianMap
-from ..render.inspection import error_shares
+from ..render.notes import Notes
 from ..system.parallel import LruSequence
-from ..types import VOID, Intrinsics
 from .schedule import Seeding
 from .seeding import SEED_OPACITY, SeedDepth, complete_depth, seed_gaussians, seed_spacing
 from .state import OptimiserState
 from .views import View
-
-_MIN_REGION = 64
-_REGION_SAMPLES = 4000
 
 CHILDREN = 4
 CHILD_RADIUS, CHILD_OFFSET = 0.55, 0.6
@@ -45,10 +40,10 @@ HOLE = 0.55
 DEPTH_TOLERANCE = 0.05
 """T_depth, relative: a proxy nearer than the map by more adds Gaussians."""
 SPLIT_RADIUS = 1.0
-"""Pixels: smaller Gaussians are not split."""
+"""Pixels: in a view where a Gaussian is smaller it answers for nothing."""
 SPLIT_ERROR = 0.1
 """Colour error 0..1, summed over a view's pixels: Gaussians that answer for more are split."""
-PRUNE_OPACITY, PRUNE_WEIGHT, PRUNE_RADIUS = 0.03, 0.03, 0.15
+PRUNE_OPACITY, PRUNE_WEIGHT, PRUNE_RADIUS = 0.03, 0.04, 0.15
 """Gaussians go that are more transparent than this, of less blending weight in every pixel of every keyframe (a fifth
 fewer at +0.06 dB), or larger than this in units of the scene's median depth."""
 SPACINGS_ROOM = 50e6
@@ -69,7 +64,7 @@ class Growth:
 
     @torch.no_grad()
     def seed(self, index: int, what: Seeding, rendering: Rendering | None) -> None:
-        """Fill the view's holes with Gaussians at its completed depth (eq. 17): the trusted ones, or the rest.
+        """Fill the view's holes with Gaussians at its completed depth: the trusted ones, or the rest.
 
         `rendering`: the map as the view sees it, None while there is none.
         """
@@ -93,13 +88,25 @@ class Growth:
         needed = self._needed(view, rendering)
         spacing = self._spacings[index].float()
         depth, trust = self._grown_depth(view, rendering)
-        self._append(index, needed & (spacing > 0), depth, trust, spacing, GROWN_OPACITY)
+        self._append(index, needed & (spacing > 0), depth, trust, spacing, GROWN_OPACITY, weight=1.0)
 
     @torch.no_grad()
-    def split(self, found: DensificationError) -> None:
-        """Split the Gaussians that answer for the most error, where they are too large: as many as the map may hold."""
+    def note(self, notes: Notes, rows: Tensor | None, footprints: Tensor) -> None:
+        """Note what a view says of some rows, None for all: a Gaussian answers for errors (Rota Bulò, Porzi and
+        Kontschieder, "Revising Densification in Gaussian Splatting", ECCV 2024) where it is large enough to be split.
+        """
+        found = torch.stack([notes.largest, torch.where(footprints > SPLIT_RADIUS, notes.answered, 0.0)], 1)
+        noted = self.state.parameters.noted
+        if rows is None:
+            torch.maximum(noted, found, out=noted)
+        else:
+            noted.index_copy_(0, rows, torch.maximum(noted.index_select(0, rows), found))
+
+    @torch.no_grad()
+    def split(self) -> None:
+        """Split the Gaussians that answer for the most error: as many as the map may hold."""
         parameters, s = self.state.parameters, self.settings
-        wrong = torch.where(found.footprint > SPLIT_RADIUS, found.error, 0.0)
+        wrong = parameters.noted[:, 1]
         room = max(s.max_gaussians - len(parameters), 0) // (CHILDREN - 1)
         rows = torch.argsort(wrong, descending=True, stable=True)[: min(int((wrong > SPLIT_ERROR).sum()), room)]
         if len(rows):
@@ -107,17 +114,19 @@ class Growth:
             kept = torch.ones(len(parameters), dtype=torch.bool, device=rows.device)
             kept[rows] = False
             parameters.keep(kept)
-            parameters.append(children, trust)
+            parameters.append(children, trust, weight=1.0)
 
     @torch.no_grad()
-    def prune(self, largest_weight: Callable[[], Tensor] | None = None) -> None:
-        """Drop the Gaussians that are too transparent, too large or of too low `largest_weight` (M,)."""
+    def prune(self, by_weight: bool) -> None:
+        """Drop the Gaussians that are too transparent, too large or, `by_weight`, noted as of too little weight; what
+        was noted is done with."""
         parameters = self.state.parameters
         bad = useless(parameters.to_map(), PRUNE_OPACITY, PRUNE_RADIUS * self.unit)
-        if largest_weight is not None:
-            bad |= largest_weight() < PRUNE_WEIGHT
+        if by_weight:
+            bad |= parameters.noted[:, 0] < PRUNE_WEIGHT
         if bad.any():
             parameters.keep(~bad)
+        parameters.noted.zero_()
 
     @cached_property
     def _spacings(self) -> LruSequence[Tensor]:
@@ -148,21 +157,19 @@ class Growth:
 
     def _completed(self, index: int) -> SeedDepth:
         view = self.views[index]
-        return self._complete(view, view.depth, view.trust)
+        return complete_depth(view.depth.cpu().numpy(), view.trust.cpu().numpy())
 
     def _completed_by_map(self, view: View, rendering: Rendering) -> SeedDepth:
         """The view's depth, completed from what the other views have put into the map around its holes."""
         known = (rendering.silhouette > _SOLID) & (view.trust < HIGH_RELIABILITY)
         trust = torch.where(known, view.trust.clamp(min=2 * LOW_RELIABILITY), view.trust)
-        return self._complete(view, torch.where(known, rendering.depth, view.depth), trust)
-
-    def _complete(self, view: View, depth: Tensor, trust: Tensor) -> SeedDepth:
-        arrays = depth.cpu().numpy(), trust.cpu().numpy(), view.channels.cpu().numpy()
-        return complete_depth(*with_region_prior(*arrays, LOW_RELIABILITY))
+        depth = torch.where(known, rendering.depth, view.depth)
+        return complete_depth(depth.cpu().numpy(), trust.cpu().numpy())
 
     def _append(
-        self, index: int, pixels: Tensor, depth: Tensor, trust: Tensor, spacing: float | Tensor, opacity: float
-    ) -> None:
+        self, index: int, pixels: Tensor, depth: Tensor, trust: Tensor, spacing: float | Tensor, opacity: float,
+        weight: float = 0.0,
+    ) -> None:  # fmt: skip
         parameters, view = self.state.parameters, self.views[index]
         pixels = pixels & (depth > 0)
         if not pixels.any() or len(parameters) >= self.settings.max_gaussians:
@@ -172,7 +179,7 @@ class Growth:
             pixels, depth, view.colors, view.channels, spacing, self.classes, pose, view.intrinsics, view.frame_id
         )
         seeds.opacity_logits.fill_(math.log(opacity / (1 - opacity)))
-        parameters.append(seeds, trust[pixels])
+        parameters.append(seeds, trust[pixels], weight)
 
 
 def _spacing(view: View, stride: int) -> Tensor:
@@ -202,37 +209,6 @@ def useless(gaussian_map: GaussianMap, least_opacity: float, largest_radius: flo
     return ~finite | (gaussian_map.opacities < least_opacity) | (gaussian_map.radii > largest_radius)
 
 
-@dataclass(frozen=True)
-class DensificationError:
-    """Error of each Gaussian in the worst of several views: `error` (M,) in pixels times colour error, and `footprint`
-    (M,), its radius on that image in pixels."""
-
-    error: Tensor
-    footprint: Tensor
-
-    def worst_of(self, other: DensificationError) -> DensificationError:
-        """For each Gaussian the view of larger error."""
-        worse = other.error > self.error
-        return DensificationError(
-            torch.where(worse, other.error, self.error), torch.where(worse, other.footprint, self.footprint)
-        )
-
-
-@torch.no_grad()
-def densification_error(
-    gaussian_map: GaussianMap, cam_from_world: Tensor, intrinsics: Intrinsics, error_of: Callable[[Tensor], Tensor]
-) -> DensificationError:
-    """Compute the error of each Gaussian in one view: the errors of the pixels, weighted by its share in them, summed.
-
-    `error_of`: (H, W, 3) colours of the map to (H, W) errors (the error of Rota Bulò, Porzi and Kontschieder, "Revising
-    Densification in Gaussian Splatting", ECCV 2024).
-    """
-    m = gaussian_map
-    return DensificationError(
-        *error_shares(m.means, m.radii, m.opacities, m.colors, cam_from_world, intrinsics, error_of)
-    )
-
-
 def split(gaussian_map: GaussianMap, rows: Tensor) -> GaussianMap:
     """Four children in place of each of the given rows (n,), in a square in the plane of the map around the parent."""
     first, second = _tangents(gaussian_map.means.cpu().numpy(), rows.cpu().numpy())
@@ -257,55 +233,3 @@ def _tangents(means: NDArray[np.float32], rows: NDArray[np.int64]) -> tuple[NDAr
     around -= around.mean(1, keepdims=True)
     _, directions = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
     return directions[:, :, 2], directions[:, :, 1]
-
-
-def with_region_prior(
-    depth: NDArray[np.float32], trust: NDArray[np.float32], channels: NDArray[np.uint8], low: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Inverse depth, 0 = unknown, and trust (H, W), in which pixels trusted up to `low` have the depth of their region.
-
-    A region is connected and of one class in channels (H, W); μ_k of eq. (17) is a plane in inverse depth over it, so
-    that slanted walls keep their slant.
-    """
-    inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
-    out, out_trust = inverse.copy(), np.where(depth > 0, trust, 0).astype(np.float32)
-    trust = out_trust.copy()
-    for channel in np.unique(channels[channels != VOID]):
-        mask = (channels == channel).astype(np.uint8)
-        _, regions, boxes, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
-        for region in 1 + np.flatnonzero(boxes[1:, cv2.CC_STAT_AREA] >= _MIN_REGION):
-            left, top, width, height = boxes[region, : cv2.CC_STAT_AREA]
-            rows, columns = np.nonzero(regions[top : top + height, left : left + width] == region)
-            rows, columns = rows + top, columns + left
-            weak = trust[rows, columns] <= low
-            reliable = ~weak & (inverse[rows, columns] > 0)
-            if not weak.any() or reliable.sum() < _MIN_REGION:
-                continue
-            mean, spread = _fit_plane(columns, rows, inverse[rows, columns], reliable)
-            rows, columns, mean = rows[weak], columns[weak], mean[weak]
-            seen, weight = inverse[rows, columns], trust[rows, columns]
-            # The proxy's own precision at reliability U is taken as U² / 5 %²; the prior's is its residual spread.
-            proxy_precision = np.where(seen > 0, (weight / (0.05 * np.maximum(seen, 1e-9))) ** 2, 0)
-            prior_precision = 1 / max(spread, 1e-9) ** 2
-            fused = (proxy_precision * seen + prior_precision * mean) / (proxy_precision + prior_precision)
-            good = (mean > 0) & (spread < 0.1 * mean)
-            out[rows[good], columns[good]] = fused[good]
-            out_trust[rows[good], columns[good]] = np.maximum(weight[good], low / 2)
-    return out, out_trust
-
-
-def _fit_plane(
-    columns: NDArray, rows: NDArray, values: NDArray[np.float32], use: NDArray[np.bool_]
-) -> tuple[NDArray[np.float32], float]:
-    """Robust plane a x + b y + c through the used values, at all places, and the spread of its residuals."""
-    picked = np.flatnonzero(use)
-    picked = picked[:: max(len(picked) // _REGION_SAMPLES, 1)]
-    design = np.stack([columns, rows, np.ones(len(rows))], 1) / [1000, 1000, 1]
-    target, weights = values[picked].astype(np.float64), np.ones(len(picked))
-    for _ in range(5):
-        a = design[picked] * weights[:, None]
-        plane = np.linalg.lstsq(a, target * weights, rcond=None)[0]
-        residual = np.abs(design[picked] @ plane - target)
-        spread = 1.4826 * float(np.median(residual))
-        weights = np.sqrt(1 / np.maximum(residual / max(spread, 1e-9), 1))
-    return (design @ plane).astype(np.float32), spread

@@ -1,8 +1,7 @@
 """Optimising the map against its views: seed along the keyframes, then visit all of them in random order."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import partial, reduce
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -11,15 +10,15 @@ from torch import Tensor
 
 from ..compute import gpu
 from ..compute.adam import gradients_of
-from ..compute.threads import host_threads
 from ..config import MappingConfig
-from ..render.api import Rendering, in_view, marked_in_view, render
+from ..render.api import Rendering, in_view, marked_in_view, project_map, render
 from ..render.gaussian_map import GaussianMap
-from ..render.inspection import blending_weights, class_weights
-from ..system.parallel import LruSequence, map_lookahead
+from ..render.inspection import class_weights
+from ..render.notes import Notes
+from ..system.parallel import LruSequence
 from ..system.progress import Progress, SilentProgress, is_asked
 from .exposure import SOLID, expose, fit_exposure
-from .growth import HIGH_RELIABILITY, LOW_RELIABILITY, DensificationError, Growth, densification_error
+from .growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
 from .objective import Objective, color_errors_on_card, fit_exposure_on_card
 from .schedule import Schedule, Seeding, Step
 from .seeding import SEED_LOGIT
@@ -78,7 +77,7 @@ def optimise_map(
         if snapshot is not None and (state.iteration % every == 0 or is_asked()):
             state.save(snapshot)
     if schedule.grows:
-        optimiser.growth.prune()
+        optimiser.growth.prune(by_weight=False)
     if classes > 0:
         optimiser.count_labels()
     return state.result(views, schedule.total)
@@ -111,9 +110,9 @@ class MapOptimiser:
         if step.grow:
             self.growth.grow(step.view, Rendering(*(x.detach() for x in vars(rendering).values())))
         if step.split:
-            self.growth.split(self._blame())
+            self.growth.split()
         if step.prune:
-            self.growth.prune(self._blending_weights)
+            self.growth.prune(by_weight=True)
 
     def _step(self, step: Step, view: View) -> Rendering:
         """Compare and move the map, the view's pose and its exposure; returns what the view showed before."""
@@ -128,12 +127,17 @@ class MapOptimiser:
             rows = in_view(*seeing)
             values = {k: parameters[k].detach().index_select(0, rows).requires_grad_() for k in KEYS}
         refines = self.settings.refine_poses and step.refine_pose
-        rendering = self.draw(view, pose.requires_grad_(refines), values)
+        notes = Notes(view.scene) if step.note else None
+        rendering = self.draw(view, pose.requires_grad_(refines), values, notes)
         if self.settings.exposure:
             self._expose(step.view, view, rendering)
+        if notes is not None:
+            notes.errors = self._color_errors(step.view, view, rendering.features)
         exposure = self.state.exposures[step.view]
         loss = self.objective.of(view, exposure, rendering, values["log_radii"], seen) * step.weight
         of_map, of_view = gradients_of(loss, (values, {"pose": pose} if refines else {}))
+        if notes is not None:
+            self._note(notes, rows, view, pose, values)
         rates = {key: rate * step.rate for key, rate in MAP_RATES.items()}
         parameters.table.step(of_map, rates, self._shares(rows, values["log_radii"].detach()), rows)
         self.state.step_pose(step.view, view, of_view.get("pose"), POSE_RATE * step.rate)
@@ -153,25 +157,15 @@ class MapOptimiser:
         pose, values = self.state.cam_from_world(index, view), {k: self.state.parameters[k] for k in KEYS}
         self.growth.seed(index, what, self.draw(view, pose, values) if known else None)
 
-    def _blame(self) -> DensificationError:
-        """What each Gaussian answers for in the view where that is most."""
-        gaussian_map, state = self.state.parameters.to_map(), self.state
-
-        def of_view(i: int) -> DensificationError:
-            view, errors = self.views[i], partial(self._color_errors, i)
-            return densification_error(gaussian_map, state.cam_from_world(i, view), view.intrinsics, errors)
-
-        return reduce(DensificationError.worst_of, self._of_views(of_view))
-
-    def _of_views(self, look: Callable[[int], T]) -> Iterator[T]:
-        """Look at each view in turn; on a card, whose kernels wait for each other anyway, one by one."""
-        self.state.settle_poses()
-        return map_lookahead(look, range(len(self.views)), host_threads(self.state.parameters["means"]))
+    @torch.no_grad()
+    def _note(self, notes: Notes, rows: Tensor | None, view: View, pose: Tensor, values: Mapping[str, Tensor]) -> None:
+        radii = torch.exp(values["log_radii"])
+        self.growth.note(notes, rows, project_map(values["means"], radii, pose, view.intrinsics)[2])
 
     @torch.no_grad()
-    def _color_errors(self, index: int, colors: Tensor) -> Tensor:
+    def _color_errors(self, index: int, view: View, colors: Tensor) -> Tensor:
         """(H, W) mean difference between the view's photo and the (H, W, 3) colours of the map."""
-        view, exposure = self.views[index], self.state.exposures[index]
+        exposure = self.state.exposures[index]
         if gpu.supports_triton(colors):
             return color_errors_on_card(colors, view, exposure)
         return view.of_scene((expose(colors, exposure) - view.colors).abs().mean(-1))
@@ -185,22 +179,9 @@ class MapOptimiser:
         exposure = self.state.exposures[index]
         exposure.copy_(fit_exposure(shown, view.colors, known, exposure))
 
-    def _blending_weights(self) -> Tensor:
-        """(M,) the largest weight with which each Gaussian stands in any pixel of any view. What stands only where
-        views show no part of the scene has none: nothing tells it where to be."""
-        p = self.state.parameters
-        arguments = (p["means"], torch.exp(p["log_radii"]), torch.sigmoid(p["opacity_logits"]))
-
-        def of_view(index: int) -> Tensor:
-            view = self.views[index]
-            pose = self.state.cam_from_world(index, view)
-            counts = None if view.scene is None else view.scene.float()
-            found = blending_weights(*arguments, pose, view.intrinsics, counts=counts)
-            return found.largest if counts is None else torch.minimum(found.largest, found.total)
-
-        return reduce(torch.maximum, self._of_views(of_view))
-
-    def draw(self, view: View, cam_from_world: Tensor, values: Mapping[str, Tensor]) -> Rendering:
+    def draw(
+        self, view: View, cam_from_world: Tensor, values: Mapping[str, Tensor], notes: Notes | None = None
+    ) -> Rendering:
         """Gaussians of raw parameters as the view sees them from (4, 4)."""
         return render(
             values["means"],
@@ -209,6 +190,7 @@ class MapOptimiser:
             values["colors"],
             cam_from_world,
             view.intrinsics,
+            notes=notes,
         )
 
     def _shares(self, rows: Tensor | None, log_radii: Tensor) -> dict[str, Tensor]:

@@ -43,17 +43,19 @@ class Seeding(Enum):
 
 @dataclass(frozen=True)
 class Step:
-    """One visit: view index, loss weight, learning rate factor, and what happens around it."""
+    """One visit: view index, loss weight, learning rate factor, and what happens around it; `note`: what each Gaussian
+    weighs and answers for is noted, for the splitting and pruning at the end of the pass."""
 
     view: int
     weight: float
     rate: float
     coarse: bool
-    seed: Seeding
-    grow: bool
-    split: bool
-    prune: bool
-    refine_pose: bool
+    seed: Seeding = Seeding.NOTHING
+    grow: bool = False
+    note: bool = False
+    split: bool = False
+    prune: bool = False
+    refine_pose: bool = False
 
 
 @dataclass(frozen=True)
@@ -118,11 +120,11 @@ class Schedule:
             view = self._covisible(now, rng) if nth % 2 else int(rng.integers(now))
         weights = keyframe_weights(now, self.reliability, TIME_DECAY, RELIABILITY_DECAY)
         seed = Seeding.TRUSTED if nth == 0 else Seeding.NOTHING
-        return Step(view, float(weights[view]), 1.0, True, seed, False, False, False, False)
+        return Step(view, float(weights[view]), 1.0, True, seed)
 
     def _filling_step(self, view: int) -> Step:
         weights = keyframe_weights(0, self.reliability, 0.0, RELIABILITY_DECAY)
-        return Step(view, float(weights[view]), 1.0, True, Seeding.REST, False, False, False, False)
+        return Step(view, float(weights[view]), 1.0, True, Seeding.REST)
 
     def _covisible(self, now: int, rng: np.random.Generator) -> int:
         row = slice(*self.overlap.indptr[now : now + 2])
@@ -143,27 +145,23 @@ class Schedule:
         turn = (number - coarse_passes) % DENSIFY_EVERY == 0
         return False, turn and number < DENSIFY_UNTIL * passes and self.grows
 
-    def _follows_new_ones(self, number: int) -> bool:
-        """Whether the pass before this one added to the map: pruned any sooner, the new ones would go while they are
-        still nearly transparent."""
-        return self.seeding > 0 if number == 0 else self._kind_of_pass(number - 1)[1]
-
     def _visit(self, iteration: int) -> Step:
         visit = iteration - self.seeding
         number, place = divmod(visit, self.views)
         view = int(np.random.default_rng([self.seed, 2, number]).permutation(self.views)[place])
         share = visit / max(self.visits, 1)
         coarse, grows = self._kind_of_pass(number)
+        notes, last = grows or (number > 0 and self._kind_of_pass(number - 1)[1]), place == self.views - 1
         weights = keyframe_weights(0, self.reliability, 0.0, RELIABILITY_DECAY)
         return Step(
             view=view,
             weight=float(weights[view] / weights.mean()),
             rate=self.first_rate * (RATE_DECAY / self.first_rate) ** share,
             coarse=coarse,
-            seed=Seeding.NOTHING,
             grow=grows,
-            split=grows and place == self.views - 1,
-            prune=place == self.views - 1 and self._follows_new_ones(number),
+            note=notes,
+            split=grows and last,
+            prune=notes and last,
             refine_pose=view != 0,
         )
 

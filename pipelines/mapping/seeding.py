@@ -30,14 +30,12 @@ class SeedDepth:
     trust: NDArray[np.float32]
 
 
-def complete_depth(inverse: NDArray[np.float32], trust: NDArray[np.float32]) -> SeedDepth:
-    """A depth for every pixel of (H, W) inverse depths, 0 = unknown: where it is unknown, filled from around.
-
-    trust (H, W) is 0 where the depth is unknown, and stays so.
-    """
-    known = inverse > 0
+def complete_depth(depth: NDArray[np.float32], trust: NDArray[np.float32]) -> SeedDepth:
+    """A depth for every pixel of (H, W), 0 = unknown: what is unknown is filled from around it, and not trusted."""
+    known = depth > 0
     if not known.any():
-        return SeedDepth(np.zeros_like(inverse), np.zeros_like(inverse))
+        return SeedDepth(np.zeros_like(depth), np.zeros_like(depth))
+    inverse, trust = np.divide(1, depth, out=np.zeros_like(depth), where=known), np.where(known, trust, 0)
     filled = np.where(known, inverse, fill_smoothly(inverse, trust))
     return SeedDepth((1.0 / np.maximum(filled, 1e-9)).astype(np.float32), trust)
 

@@ -20,7 +20,7 @@ from .views import View
 
 KEYS = ("means", "log_radii", "opacity_logits", "colors")
 """What is optimised."""
-_BESIDE = ("class_logits", "anchor_frame_ids", "trust")
+_BESIDE = ("class_logits", "anchor_frame_ids", "trust", "noted")
 
 VIEW_KEYS = ("twist",)
 
@@ -132,20 +132,23 @@ class OptimiserState:
 
 @dataclass
 class MapParameters:
-    """A Gaussian map being optimised; beside it `class_logits` (M, C), `anchor_frame_ids` (M,) and `trust` (M,) 0..1 of
-    the depth it was seeded at."""
+    """A Gaussian map being optimised; beside it `class_logits` (M, C), `anchor_frame_ids` (M,), `trust` (M,) 0..1 of
+    the depth it was seeded at, and `noted` (M, 2) of this pass so far: the largest blending weight in any pixel, and
+    the colour error that a Gaussian answers for in the view where that is most."""
 
     table: AdamTable
     class_logits: Tensor
     anchor_frame_ids: Tensor
     trust: Tensor
+    noted: Tensor
 
     @staticmethod
     def from_map(gaussian_map: GaussianMap) -> MapParameters:
         """Fresh moments, full trust."""
         values = {k: getattr(gaussian_map, k) for k in KEYS}
         m = gaussian_map
-        return MapParameters(AdamTable(values), m.class_logits, m.anchor_frame_ids, torch.ones_like(m.log_radii))
+        beside = (m.class_logits, m.anchor_frame_ids, torch.ones_like(m.log_radii), m.log_radii.new_zeros(len(m), 2))
+        return MapParameters(AdamTable(values), *beside)
 
     def to_map(self) -> GaussianMap:
         """Return a copy of the current map."""
@@ -168,13 +171,16 @@ class MapParameters:
         self.table.keep(rows)
         self.class_logits = self.class_logits[rows]
         self.anchor_frame_ids, self.trust = self.anchor_frame_ids[rows], self.trust[rows]
+        self.noted = self.noted[rows]
 
-    def append(self, seeds: GaussianMap, trust: Tensor) -> None:
-        """Add Gaussians with empty moments."""
+    def append(self, seeds: GaussianMap, trust: Tensor, weight: float = 0.0) -> None:
+        """Add Gaussians with empty moments, their weight noted as given: what is added within a pass that notes weights
+        was not there for its first visits, and would be pruned for it."""
         self.table.append({k: getattr(seeds, k) for k in KEYS})
         self.class_logits = torch.cat([self.class_logits, seeds.class_logits])
         self.anchor_frame_ids = torch.cat([self.anchor_frame_ids, seeds.anchor_frame_ids])
         self.trust = torch.cat([self.trust, trust])
+        self.noted = torch.cat([self.noted, self.noted.new_tensor([[weight, 0.0]]).expand(len(trust), 2)])
 
     def to_tensors(self) -> dict[str, Tensor]:
         """A flat table for a snapshot."""

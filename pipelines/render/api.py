@@ -16,6 +16,7 @@ from ..geometry import se3
 from ..geometry.camera import project_gaussians
 from ..types import Intrinsics
 from . import reference
+from .notes import Notes
 
 NEAR = 0.01
 """Gaussians whose centre is nearer than this (or behind the camera) are not drawn; in the unit of the map."""
@@ -40,26 +41,28 @@ def render(
     twist: Tensor | None = None,
     near: float = NEAR,
     backend: str | None = None,
+    notes: Notes | None = None,
 ) -> Rendering:
     """Draw M Gaussians from the pose exp(twist) @ cam_from_world; differentiable in all of them.
 
     means (M, 3), radii (M,) world standard deviations, opacities (M,) 0..1, features (M, C), cam_from_world (4, 4),
-    twist (6,) translation first (see `pipelines.geometry.se3`). Pose and twist best stay on
-    the host where the Gaussians lie on a card: on six numbers a card is slower. Raises ValueError for wrong shapes, and
-    for NaN and infinity in what lies on the CPU.
+    twist (6,) translation first (see `pipelines.geometry.se3`). Pose and twist best stay on the host where the
+    Gaussians lie on a card: on six numbers a card is slower. The backward pass fills the notes. Raises
+    ValueError for wrong shapes, and for NaN and infinity in what lies on the CPU.
     """
     pose = cam_from_world if twist is None else moved(cam_from_world, twist)
     if (kernels := kernels_for(backend, means)) is not None:
         size = (intrinsics.width, intrinsics.height)
         check_arguments({"radii": radii, "opacities": opacities, "features": features}, *size)
         records = kernels.project(means, radii, opacities, beside(pose, means), intrinsics, near)
-        shown, above, below, silhouette = kernels.composite_records(records, features, *size)
+        shown, above, below, silhouette = kernels.composite_records(records, features, *size, notes=notes)
         return Rendering(shown, kernels.depth_ratio(above, below), silhouette)
     if not torch.is_grad_enabled():
         rows = in_view(means, radii, pose, intrinsics, near)
         means, radii, opacities, features = (x.index_select(0, rows) for x in (means, radii, opacities, features))
     u, v, sigma_px, z = project_map(means, radii, pose, intrinsics, near)
-    image = composite(u, v, sigma_px, z, opacities, features, intrinsics.width, intrinsics.height, backend, near)
+    size = (intrinsics.width, intrinsics.height)
+    image = composite(u, v, sigma_px, z, opacities, features, *size, backend, near, notes)
     depth = depth_ratio(image.depth_sum, image.depth_silhouette)
     return Rendering(image.features, depth, image.silhouette)
 
@@ -175,17 +178,19 @@ def composite(
     height: int,
     backend: str | None = None,
     near: float = 0.0,
+    notes: Notes | None = None,
 ) -> Composite:
     """Blend M Gaussians into a width x height image; differentiable in the first six arguments.
 
     u, v, sigma_px (M,) pixels, pixel centres at half integers; z (M,) depth, ignored where <= near; opacity (M,) 0..1;
-    features (M, C). backend: "reference", "cpu", "cuda" or None for the fastest that runs these tensors. Raises
+    features (M, C). backend: "reference", "cpu", "cuda" or None for the fastest that runs these tensors. notes: filled
+    by the backward pass. Raises
     ValueError for wrong shapes, for NaN or infinity on the CPU (by the argument's name) and for an unknown backend.
     """
     arguments = {"u": u, "v": v, "sigma_px": sigma_px, "z": z, "opacity": opacity, "features": features}
     check_arguments(arguments, width, height)
     module = choose_backend(backend, u)
-    return Composite(*module.composite(u, v, sigma_px, z, opacity, features, width, height, float(near)))
+    return Composite(*module.composite(u, v, sigma_px, z, opacity, features, width, height, float(near), notes))
 
 
 def check_arguments(arguments: dict[str, Tensor], width: int, height: int) -> None:

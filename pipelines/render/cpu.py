@@ -10,9 +10,10 @@ from ..compute.threads import as_array
 from .cpu_backward import pull_back
 from .cpu_bands import split_into_bands
 from .cpu_forward import draw_bands, padded_channels
-from .cpu_inspect import class_weights, inspect, look, weighted_errors
+from .cpu_inspect import class_weights, inspect, look
+from .notes import Notes
 
-__all__ = ["class_weights", "composite", "inspect", "look", "weighted_errors"]
+__all__ = ["class_weights", "composite", "inspect", "look"]
 
 
 def composite(
@@ -25,16 +26,18 @@ def composite(
     width: int,
     height: int,
     near: float,
+    notes: Notes | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the feature image (H, W, C), depth sum, depth silhouette and silhouette (H, W) of float32 CPU tensors."""
-    return _Composite.apply(u, v, sigma_px, z, opacity, features, width, height, near)
+    """Return the feature image (H, W, C), depth sum, depth silhouette and silhouette (H, W) of float32 CPU tensors;
+    the backward pass fills the notes."""
+    return _Composite.apply(u, v, sigma_px, z, opacity, features, width, height, near, notes)
 
 
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         *projected, values = (as_array(tensor) for tensor in arguments[:6])
-        width, height, near = arguments[6:]
+        width, height, near, ctx.notes = arguments[6:]
         bands = split_into_bands(tuple(projected), values, padded_channels(values.shape[1]), width, height, near)
         features, planes = draw_bands(bands, values.shape[1], width, height)
         outputs = (torch.from_numpy(features), *torch.from_numpy(planes).unbind(0))
@@ -51,5 +54,8 @@ class _Composite(torch.autograd.Function):
             np.zeros_like(image) if gradient is None else as_array(gradient)
             for image, gradient in zip((features, *planes), gradients, strict=True)
         ]
-        d_geometry, d_features = pull_back(bands, features, planes, upstream[0], np.stack(upstream[1:]))
-        return (*torch.from_numpy(d_geometry).unbind(0), torch.from_numpy(d_features), *[None] * 3)
+        marks = None if ctx.notes is None else ctx.notes.marks()
+        d_geometry, d_features, noted = pull_back(bands, features, planes, upstream[0], np.stack(upstream[1:]), marks)
+        if ctx.notes is not None:
+            ctx.notes.largest, ctx.notes.answered = torch.from_numpy(noted).unbind(1)
+        return (*torch.from_numpy(d_geometry).unbind(0), torch.from_numpy(d_features), *[None] * 4)

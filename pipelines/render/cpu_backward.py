@@ -10,16 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compute.lanes import add_totals, load, reciprocal, splat, store, where
+from ..compute.lanes import add_totals, load, maximum, reciprocal, reduce_max, splat, store, total, where
 from ..compute.threads import PART, for_each, inlined, inner, kernel
 from . import reference
 from .cpu_bands import PIXELS, RECORD, TILE, Bands, clear, for_each_band, row_opacity, walk_tiles
 from .cpu_forward import Vectors, vectors_for
 
 F32 = np.float32
-BEHIND, D_DEPTH, D_SEEN, WEIGHTS = (PIXELS * i for i in range(4))
-"""Planes of a tile's state: what is still behind; the gradients of depth sum and silhouette; weights of a Gaussian."""
-PLANES = 4
+BEHIND, D_DEPTH, D_SEEN, WEIGHTS, ERROR, COUNT = (PIXELS * i for i in range(6))
+"""Planes of a tile's state: what is still behind; the gradients of depth sum and silhouette; weights of a Gaussian;
+the errors of the pixels and what they count, where somebody asks for `Notes`."""
+PLANES = 6
 COLORS = 3
 GEOMETRY = 5
 """u, v, sigma_px, z, opacity."""
@@ -30,29 +31,37 @@ _HALF, _ZERO, _ONE = F32(0.5), F32(0), F32(1)
 
 def pull_back(
     bands: Bands, features: NDArray[np.float32], planes: NDArray[np.float32], d_features: NDArray[np.float32],
-    d_planes: NDArray[np.float32],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
-    """Return the gradients of the Gaussians' u, v, sigma_px, z, opacity (5, M) and of their features (M, C).
+    d_planes: NDArray[np.float32], marks: NDArray[np.float32] | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+    """Return the gradients of the Gaussians' u, v, sigma_px, z, opacity (5, M) and of their features (M, C); and (M, 2)
+    the largest blending weight of each and the errors of the pixels weighed by it and summed, (0, 2) without marks.
 
     Args:
         bands: as the forward pass had them.
         features, planes: its images (H, W, C) and (3, H, W).
         d_features, d_planes: their gradients.
+        marks: (2, H, W), the error of each pixel, and 1 where its weights count for the largest.
     """
     count, used = len(bands.first), features.shape[2]
     d_geometry, d_values = np.zeros((GEOMETRY, count), F32), np.zeros((count, used), F32)
     shared = np.empty((int(bands.slots[-1]), GEOMETRY + used), F32)
-    given = (features, planes, d_features, d_planes, d_geometry, d_values, shared)
+    noted, noted_apart = (np.zeros((n if marks is not None else 0, 2), F32) for n in (count, len(shared)))
+    asked = (np.zeros((2, 0, 0), F32) if marks is None else marks, noted, noted_apart)
+    given = (features, planes, d_features, d_planes, d_geometry, d_values, shared, *asked)
     vectors, places = vectors_for(used), (bands.first, bands.slots)
     for_each_band(lambda b: backward_band(vectors, b, bands.own(b), *places, *bands.prepared[b], *given), bands.starts)
     for_each(lambda n: sum_shared(n * PART, PART, bands.slots, shared, d_geometry, d_values), -(-count // PART))
-    return d_geometry, d_values
+    if marks is not None and len(straddling := bands.straddling):
+        starts = bands.slots[straddling]
+        noted[straddling, 0] = np.maximum.reduceat(noted_apart[:, 0], starts)
+        noted[straddling, 1] = np.add.reduceat(noted_apart[:, 1], starts)
+    return d_geometry, d_values, noted
 
 
 @inner
 def open_gradients(job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.float32], tile: tuple[int, ...]) -> None:
     """Load the gradients of the pixels of a tile and everything that will be blended into them."""
-    state, image, _, _, features, planes, d_features, d_planes = job
+    state, image, _, _, features, planes, d_features, d_planes, marks, _ = job
     left, top, columns, rows = tile
     clear(state)
     for y in range(rows):
@@ -68,6 +77,8 @@ def open_gradients(job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.flo
             depth_behind = d_depth * planes[0, row, column] + d_depth_seen * planes[1, row, column]
             state[BEHIND + pixel] = behind + depth_behind
             state[D_SEEN + pixel] = d_seen + d_depth_seen
+            if marks.size > 0:
+                state[ERROR + pixel], state[COUNT + pixel] = marks[0, row, column], marks[1, row, column]
 
 
 @inner
@@ -93,7 +104,7 @@ def pull(
     They are those of m = alpha * d loss / d alpha times 1, dx, dy, distance², column by column. The gradients of the
     image lie in the planes of `image`; of three features they stay in registers, of others they are walked over twice.
     """
-    state, image, d_records, padded = job[0], job[1], job[2], job[3]
+    state, image, d_records, padded, noted = job[0], job[1], job[2], job[3], job[9]
     _, dx, dx2, center, _, z = pair
     first, last = box[2], box[3]
     used = len(image) // PIXELS
@@ -115,6 +126,7 @@ def pull(
             pulled, pulled_y, pulled_y2 = pulled + m, pulled_y + m * dy, pulled_y2 + m * (dy * dy)
             d_z = d_z + weight * d_depth
             d_red, d_green, d_blue = d_red + weight * by_red, d_green + weight * by_green, d_blue + weight * by_blue
+            store(state, WEIGHTS + row, weight)
         add_totals(d_records, 8 * i + 4, pulled, d_red, d_green, d_blue)
         add_totals(d_records, 8 * i, pulled * dx, pulled_y, pulled * dx2 + pulled_y2, d_z)
     else:
@@ -142,6 +154,19 @@ def pull(
                 a, b = a + weight * load(image, plane), b + weight * load(image, plane + PIXELS)
                 d, e = d + weight * load(image, plane + 2 * PIXELS), e + weight * load(image, plane + 3 * PIXELS)
             add_totals(d_records, size * i + 8 + c, a, b, d, e)
+    if len(noted) > 0:
+        note(state, noted, i, first, last)
+
+
+@inner
+def note(state: NDArray[np.float32], noted: NDArray[np.float32], i: int, first: int, last: int) -> None:
+    """Note a Gaussian's largest weight in rows first..last of a tile, and add what it answers for."""
+    most, answered = splat(_ZERO), splat(_ZERO)
+    for row in range(TILE * first, TILE * last + TILE, TILE):
+        weight = load(state, WEIGHTS + row)
+        most, answered = maximum(most, weight * load(state, COUNT + row)), answered + weight * load(state, ERROR + row)
+    noted[i, 0] = max(noted[i, 0], reduce_max(most))
+    noted[i, 1] += total(answered)
 
 
 @inner
@@ -167,9 +192,12 @@ def backward_band(
     d_geometry: NDArray[np.float32],
     d_features: NDArray[np.float32],
     shared: NDArray[np.float32],
+    marks: NDArray[np.float32],
+    noted: NDArray[np.float32],
+    noted_apart: NDArray[np.float32],
 ) -> None:
     """Gradients of the Gaussians seen in a band: of u, v, sigma_px, z, opacity to d_geometry (5, M) and of the features
-    to d_features (M, C), or, where other bands add to them too, to their row of `shared` (S, 5 + C).
+    to d_features (M, C), or, where other bands add to them too, to their row of `shared` (S, 5 + C); likewise `noted`.
 
     features and planes are the images of the forward pass, d_image and d_planes their gradients.
     """
@@ -178,7 +206,9 @@ def backward_band(
     size, features_at = (8, GEOMETRY) if vectors is None else (8 + lanes_used, 8)
     d_records = np.zeros(size * len(own), np.float32)
     image = np.zeros(PIXELS * (COLORS if vectors is None else lanes_used), np.float32)
-    job = (np.empty(PIXELS * PLANES, np.float32), image, d_records, padded, features, planes, d_image, d_planes)
+    notes = np.zeros((len(own) if marks.size > 0 else 0, 2), np.float32)
+    state = np.empty(PIXELS * PLANES, np.float32)
+    job = (state, image, d_records, padded, features, planes, d_image, d_planes, marks, notes)
     visitors = (open_gradients, pull, close_gradients)
     walk_tiles(visitors, job, vectors, band, tile_starts, members, records, width, height)
     for k in range(len(own)):
@@ -195,11 +225,15 @@ def backward_band(
                 row[j] = d_records[at + j]
             for c in range(used):
                 row[GEOMETRY + c] = d_records[at + features_at + c]
+            for j in range(2 if marks.size > 0 else 0):
+                noted_apart[slots[i] + band - first[i], j] = notes[k, j]
         else:
             for j in range(GEOMETRY):
                 d_geometry[j, i] = d_records[at + j]
             for c in range(used):
                 d_features[i, c] = d_records[at + features_at + c]
+            for j in range(2 if marks.size > 0 else 0):
+                noted[i, j] = notes[k, j]
 
 
 @kernel

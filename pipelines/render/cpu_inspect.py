@@ -1,6 +1,5 @@
 """One forward walk that keeps what an image does not show: median depth, and how much each Gaussian was seen."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from torch import Tensor
 from ..compute.lanes import load, maximum, reduce_max, splat, store, total, where
 from ..compute.threads import inlined, inner, kernel
 from .cpu_bands import PIXELS, TILE, Bands, clear, for_each_band, split_into_bands, walk_tiles
-from .cpu_forward import DEPTH_SUM, WEIGHTS, blend_rows, draw_bands, paint_rows
+from .cpu_forward import DEPTH_SUM, WEIGHTS, blend_rows, paint_rows
 
 F32 = np.float32
 MEDIAN, COUNT, PLANES = 2 * PIXELS, 3 * PIXELS, 4
@@ -33,18 +32,6 @@ def inspect(
     counted = torch.ones(height, width) if counts is None else counts
     median, found = _walk(bands, counted, torch.zeros(height, width, dtype=torch.uint8), 0)
     return median, found[:, 0], found[:, 1]
-
-
-def weighted_errors(
-    u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, colors: Tensor, width: int, height: int,
-    near: float, error_of: Callable[[Tensor], Tensor],
-) -> Tensor:  # fmt: skip
-    """Sum the blending weights (M,) of each Gaussian over the pixels, each weighed with its error: `error_of` the
-    (H, W, 3) colours that are shown, (H, W); float32 CPU tensors."""
-    bands = bands_of((u, v, sigma_px, z, opacity), colors, width, height, near)
-    shown, _ = draw_bands(bands, 3, width, height)
-    errors = error_of(torch.from_numpy(shown))
-    return _walk(bands, errors, torch.zeros(height, width, dtype=torch.uint8), 0)[1][:, 0]
 
 
 def class_weights(

@@ -14,6 +14,7 @@ from ..compute import gpu
 from . import reference
 from .cuda_kernels import backward_tile, divide_back_pixels, divide_pixels, forward_tile, inspect_tile
 from .cuda_projection import project, record
+from .notes import Notes
 
 __all__ = ["composite", "composite_records", "depth_ratio", "inspect", "inspect_records", "list_tiles", "project"]
 
@@ -35,19 +36,20 @@ def composite(
     width: int,
     height: int,
     near: float,
+    notes: Notes | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the feature image (H, W, C), depth sum, depth silhouette and silhouette (H, W) of tensors on one GPU."""
     records = record((u, v, sigma_px, z, opacity), width, height, near)
-    return composite_records(records, features, width, height)
+    return composite_records(records, features, width, height, notes)
 
 
 def composite_records(
-    records: Tensor, features: Tensor, width: int, height: int, tiles: tuple[Tensor, Tensor] | None = None
+    records: Tensor, features: Tensor, width: int, height: int, notes: Notes | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The same of the Gaussians' records (M, 6); `tiles`: what `list_tiles` says of them, where that is known."""
+    """The same of the Gaussians' records (M, 6); the backward pass fills the notes."""
     if features.dtype != torch.float32:
         raise ValueError(f"the cuda backend renders float32, got {features.dtype}")
-    return _Composite.apply(records, features, width, height, tiles)
+    return _Composite.apply(records, features, width, height, notes)
 
 
 def inspect(
@@ -84,8 +86,8 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         records, features = (x.detach().contiguous() for x in arguments[:2])
-        width, height, tiles = arguments[2:]
-        starts, members = tiles or list_tiles(records, width, height)
+        width, height, ctx.notes = arguments[2:]
+        starts, members = list_tiles(records, width, height)
         image = features.new_empty(height, width, features.shape[1])
         planes = [features.new_empty(height, width) for _ in range(3)]
         inputs = (starts, members, records, features)
@@ -101,7 +103,9 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
         inputs, images = saved[:4], saved[4:]
-        starts, _, records, features = inputs
+        starts, members, records, features = inputs
+        if ctx.notes is not None:
+            ctx.notes.fill(lambda counts: inspect_records(records, *ctx.size[:2], counts, (starts, members)))
         upstream = [
             torch.zeros_like(image) if gradient is None else gradient.contiguous()
             for image, gradient in zip(images, gradients, strict=True)

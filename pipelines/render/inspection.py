@@ -1,6 +1,5 @@
 """Forward-only views of the map: the depth of surfaces, and how much each Gaussian takes part in an image."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -121,40 +120,6 @@ def class_weights(
         shown = render(*seen, features, cam_from_world, intrinsics, backend=backend).features
         found = torch.autograd.grad(shown, features, given.reshape(shown.shape))[0]
     return torch.arange(len(means), device=means.device), found
-
-
-def error_shares(
-    means: Tensor,
-    radii: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    cam_from_world: Tensor,
-    intrinsics: Intrinsics,
-    error_of: Callable[[Tensor], Tensor],
-) -> tuple[Tensor, Tensor]:
-    """The errors of the pixels, weighed by each Gaussian's part in them and summed, and its radius in pixels, of those
-    in view; (M,) each. `error_of`: (H, W, 3) colours of the map to (H, W) errors. No gradients; the others as in
-    `render`."""
-    seen = (means.detach(), radii.detach(), opacities.detach())
-    if (module := _compiled(None, means)) is not None:
-        rows = in_view(*seen[:2], cam_from_world, intrinsics)
-        means, radii, opacities, colors = (x.index_select(0, rows) for x in (*seen, colors))
-        u, v, sigma_px, z = project_map(means, radii, cam_from_world, intrinsics)
-        size = (intrinsics.width, intrinsics.height)
-        given = (u, v, sigma_px, z, opacities, colors, *size, NEAR, error_of)
-        found = (module.weighted_errors(*given), sigma_px)
-        errors, footprints = (torch.zeros_like(seen[1]).index_copy(0, rows, x) for x in found)
-        return errors, footprints
-    if (kernels := kernels_for(None, means)) is None:
-        shown = render(*seen, colors.detach(), cam_from_world, intrinsics).features
-        weights = blending_weights(*seen, cam_from_world, intrinsics, counts=error_of(shown))
-        return weights.total, project_map(*seen[:2], cam_from_world, intrinsics)[2]
-    # Projected and listed once for both.
-    size = (intrinsics.width, intrinsics.height)
-    records = kernels.project(*seen, cam_from_world.to(means), intrinsics, NEAR)
-    tiles = kernels.list_tiles(records, *size)
-    shown = kernels.composite_records(records, colors.detach(), *size, tiles)[0]
-    return kernels.inspect_records(records, *size, error_of(shown), tiles)[1], records[:, 2]
 
 
 def _compiled(backend: str | None, example: Tensor) -> ModuleType | None:

@@ -11,10 +11,13 @@ TRANSMITTANCE_MIN.
 
 import warnings
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from .notes import Notes
 
 ALPHA_MIN = 1 / 255
 """Opacity at which a Gaussian ends: less cannot be seen in an 8-bit image."""
@@ -53,8 +56,10 @@ def composite(
     width: int,
     height: int,
     near: float,
+    notes: Notes | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Feature image (H, W, C), depth sum, depth silhouette and silhouette (H, W): eq. (6)-(9) by autograd."""
+    """Feature image (H, W, C), depth sum, depth silhouette and silhouette (H, W): eq. (6)-(9) by autograd; the notes
+    are filled when a gradient of the image is asked for."""
     pairs = list_pairs(u, v, sigma_px, z, opacity, width, height, near)
     alpha, _ = pair_opacities(pairs, u, v, sigma_px, z, opacity, width)
     before = transmittance_before(alpha, pairs)
@@ -63,6 +68,9 @@ def composite(
     blended = _Blend.apply(weights, torch.cat([features, ones], dim=1), pairs)
     depths = _Blend.apply(weights, torch.stack([z, ones[:, 0]], dim=1), pairs)
     shape = (height, width)
+    if notes is not None:
+        look = partial(inspect, u, v, sigma_px, z, opacity, width, height, near)
+        blended.register_hook(lambda _: notes.fill(look))
     return (
         blended[:, :-1].reshape(*shape, -1),
         depths[:, 0].view(shape),

@@ -39,7 +39,7 @@ from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.depth.stereo import card
 from msgs_slam.pipelines.depth.stereo.matching import StereoImages
 from msgs_slam.pipelines.mapping.optimise import MapOptimiser
-from msgs_slam.pipelines.mapping.schedule import Seeding, Step
+from msgs_slam.pipelines.mapping.schedule import Step
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View, make_view
 from msgs_slam.pipelines.render import api, cuda, inspection
@@ -211,9 +211,9 @@ def stereo_of_a_keyframe() -> None:
     card.fuse_depths(pictures[0], pictures[1:], warps, warps[:, 2], 0.01, DEVICE)
 
 
-def step(view: int) -> Step:
+def step(view: int, note: bool = False) -> Step:
     """A visit."""
-    return Step(view, 1.0, 0.5, False, Seeding.NOTHING, False, False, False, True)
+    return Step(view, 1.0, 0.5, False, note=note, refine_pose=True)
 
 
 def measure() -> dict[str, Counting]:
@@ -226,8 +226,7 @@ def measure() -> dict[str, Counting]:
         mapper.visit(step(2))
         return rows | {
             "poses, once a pass": counted(mapper.state.settle_poses),
-            f"weights for pruning, {VIEWS} views": counted(mapper._blending_weights),
-            f"blame for splitting, {VIEWS} views": counted(mapper._blame),
+            "a visit that notes weights and errors": counted(lambda: mapper.visit(step(1, note=True))),
             f"classes counted, {VIEWS} views": counted(mapper.count_labels),
             "stereo of a keyframe": counted(stereo_of_a_keyframe),
         }

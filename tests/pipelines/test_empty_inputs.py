@@ -39,13 +39,13 @@ from msgs_slam.pipelines.geometry.room_layout import Gravity, find_gravity, floo
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.geometry.voxels import Voxels, find_near, gather_depths, touching, voxel_keys
 from msgs_slam.pipelines.mapping.exposure import fit_exposure
-from msgs_slam.pipelines.mapping.growth import with_region_prior
 from msgs_slam.pipelines.mapping.losses import depth_loss
 from msgs_slam.pipelines.mapping.measure import depth_view, drawn_view
 from msgs_slam.pipelines.mapping.optimise import voted_logits
 from msgs_slam.pipelines.mapping.seeding import complete_depth, fill_smoothly, seed_spacing
 from msgs_slam.pipelines.mapping.submaps import nearest_seeing
 from msgs_slam.pipelines.mapping.views import halved, make_view, occurring_classes
+from msgs_slam.pipelines.paper.mapping import with_region_prior
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.scene.gps import georeference
 from msgs_slam.pipelines.scene.metres import Seen, contradiction, usual_evidence

@@ -184,9 +184,9 @@ def _visits(rows: Rows) -> None:
             state = optimiser.state
             before = {k: state.parameters[k].detach().cpu().clone() for k in KEYS}
             for i in range(SIZES.views):
-                optimiser.visit(step(i))
+                optimiser.visit(step(i, note=True))
             moved = {k: state.parameters[k].detach().cpu() - before[k] for k in KEYS}
-            rest = {"blame": optimiser._blame().error, "weights": optimiser._blending_weights()}
+            rest = dict(zip(("weights", "errors"), state.parameters.noted.unbind(1), strict=True))
             optimiser.count_labels()
             found.append({**moved, **rest, "classes": state.parameters.class_logits})
     for of, ours in found[0].items():

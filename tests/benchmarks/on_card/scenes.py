@@ -20,7 +20,7 @@ from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.depth.stereo.matching import StereoImages
 from msgs_slam.pipelines.depth.stereo.sweep import warps_to
 from msgs_slam.pipelines.mapping.optimise import MapOptimiser
-from msgs_slam.pipelines.mapping.schedule import Seeding, Step
+from msgs_slam.pipelines.mapping.schedule import Step
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View, make_view
 from msgs_slam.pipelines.render.api import render
@@ -106,9 +106,9 @@ def mapper(place: Place) -> MapOptimiser:
     return optimiser
 
 
-def step(view: int) -> Step:
+def step(view: int, note: bool = False) -> Step:
     """A steady visit: nothing is seeded, split or pruned."""
-    return Step(view, 1.0, 0.5, False, Seeding.NOTHING, False, False, False, True)
+    return Step(view, 1.0, 0.5, False, note=note, refine_pose=True)
 
 
 def _view(scene: Any, index: int, generator: torch.Generator, place: Place) -> View:

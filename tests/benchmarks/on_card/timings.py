@@ -60,8 +60,7 @@ def time_mapping(rows: Rows) -> None:
             optimiser = mapper(place)
             tasks: dict[str, Callable[[], object]] = {
                 "a visit": lambda o=optimiser: o.visit(step(1)),
-                f"weights for pruning, {SIZES.views} views": optimiser._blending_weights,
-                f"blame for splitting, {SIZES.views} views": optimiser._blame,
+                "a visit that notes weights and errors": lambda o=optimiser: o.visit(step(1, note=True)),
                 f"classes counted, {SIZES.views} views": optimiser.count_labels,
             }
             for of, task in tasks.items():

@@ -16,14 +16,12 @@ from tests.benchmarks.launches import VIEWS, measure
 def test_a_card_is_asked_for_little_and_seldom_waited_for() -> None:
     """The limits are a little above what is done: an operation that slips in by the view or by the Gaussian is seen."""
     rows = {name: found.counts for name, found in measure().items()}
-    colors, poses, weights, blame, votes, stereo = rows.values()
+    colors, poses, noting, votes, stereo = rows.values()
     assert 30 < colors["launches"] <= 50
     assert (colors["reads"], colors["bytes from it"]) == (1, 0)
     assert (poses["reads"], poses["bytes from it"]) == (1, 2 * 16 * 4)
-    assert weights["launches"] <= 12 * VIEWS
-    assert blame["launches"] <= 18 * VIEWS
+    assert noting["launches"] <= 72
+    assert (noting["reads"], noting["bytes from it"]) == (1, 0)
     assert votes["launches"] <= 40 * VIEWS
-    assert weights["reads"] == blame["reads"] == VIEWS
-    assert weights["bytes from it"] == blame["bytes from it"] == 0
     assert stereo["launches"] <= 36  # matched at two sizes
     assert stereo["reads"] == 5

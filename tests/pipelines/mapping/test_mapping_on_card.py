@@ -26,7 +26,7 @@ from msgs_slam.pipelines.mapping.objective import (  # noqa: E402
     fit_exposure_on_card,
 )
 from msgs_slam.pipelines.mapping.optimise import MapOptimiser, optimise_map  # noqa: E402
-from msgs_slam.pipelines.mapping.schedule import Seeding, Step  # noqa: E402
+from msgs_slam.pipelines.mapping.schedule import Step  # noqa: E402
 from msgs_slam.pipelines.mapping.state import (  # noqa: E402
     KEYS,
     OptimiserState,
@@ -157,15 +157,14 @@ def test_visits_are_those_of_the_cpu(started: Any, monkeypatch: pytest.MonkeyPat
         before = {k: state.parameters[k].detach().cpu().clone() for k in KEYS}
         optimiser = MapOptimiser(own, classes, MappingConfig(), state)
         for i in (0, 1, 2, 1):
-            optimiser.visit(Step(i, 1.3, 0.5, False, Seeding.NOTHING, False, False, False, i > 0))
-        blame = optimiser._blame()
+            optimiser.visit(Step(i, 1.3, 0.5, False, note=True, refine_pose=i > 0))
         result = state.result(own, 4)
         moved = {k: state.parameters[k].detach().cpu() - before[k] for k in KEYS}
         optimiser.count_labels()
         poses = torch.from_numpy(result.cam_from_world - first.cam_from_world)
         exposures = torch.from_numpy(np.stack([result.log_gains, result.offsets]))
-        rest = {"classes": state.parameters.class_logits, "weights": optimiser._blending_weights()}
-        rest |= {"blame": blame.error, "poses": poses, "exposures": exposures}
+        rest = {"classes": state.parameters.class_logits, "poses": poses, "exposures": exposures}
+        rest["weights"], rest["errors"] = state.parameters.noted.unbind(1)
         found.append({k: x.cpu().double() for k, x in (moved | rest).items()})
     for name, mine in found[0].items():
         theirs = found[1][name]

@@ -17,6 +17,7 @@ from msgs_slam.pipelines.mapping import growth, optimise, schedule
 from msgs_slam.pipelines.mapping.load import MappingInput
 from msgs_slam.pipelines.mapping.measure import ViewFigures, measure_view
 from msgs_slam.pipelines.mapping.optimise import MapOptimiser, OptimisedMap, optimise_map, voted_logits
+from msgs_slam.pipelines.mapping.schedule import Step
 from msgs_slam.pipelines.mapping.seeding import SEED_LOGIT
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View
@@ -88,7 +89,9 @@ def test_splitting_stops_at_the_largest_map(room: MappingInput, monkeypatch: pyt
     classes, most = len(room.class_ids), len(few.gaussian_map) + 31
     state = OptimiserState.fresh(room.views, classes, few.gaussian_map, None)
     optimiser = MapOptimiser(room.views, classes, replace(SETTINGS, max_gaussians=most), state)
-    optimiser.growth.split(optimiser._blame())
+    for i in range(len(room.views)):
+        optimiser.visit(Step(i, 1.0, 0.1, False, note=True))
+    optimiser.growth.split()
     assert len(state.parameters) == len(few.gaussian_map) + 30
 
 
@@ -99,7 +102,8 @@ def test_what_stands_only_where_a_view_shows_no_scene_has_no_weight(room: Mappin
 
     def weights(seen: View) -> torch.Tensor:
         state = OptimiserState.fresh([seen], len(room.class_ids), m, None)
-        return MapOptimiser([seen], len(room.class_ids), SETTINGS, state)._blending_weights()
+        MapOptimiser([seen], len(room.class_ids), SETTINGS, state).visit(Step(0, 1.0, 0.1, False, note=True))
+        return state.parameters.noted[:, 0]
 
     in_cam = m.means @ view.cam_from_world[:3, :3].float().T + view.cam_from_world[:3, 3].float()
     u, _, sigma, z = project_gaussians(in_cam, m.radii, view.intrinsics, 0.1)
@@ -133,9 +137,10 @@ def test_views_that_are_looked_at_side_by_side_say_the_same(
     def looked() -> list[torch.Tensor]:
         state = OptimiserState.fresh(room.views, len(room.class_ids), mapped.gaussian_map, None)
         optimiser = MapOptimiser(room.views, len(room.class_ids), SETTINGS, state)
-        blame, weights = optimiser._blame(), optimiser._blending_weights()
+        for i in (0, 1):
+            optimiser.visit(Step(i, 1.0, 0.1, False, note=True))
         optimiser.count_labels()
-        return [blame.error, blame.footprint, weights, state.parameters.class_logits]
+        return [state.parameters.noted, state.parameters.class_logits]
 
     before = get_threads()
     try:

@@ -6,7 +6,6 @@ import torch
 
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.mapping import growth as densify
-from msgs_slam.pipelines.mapping.growth import with_region_prior
 from msgs_slam.pipelines.mapping.seeding import complete_depth, fill_smoothly, seed_gaussians, seed_grid, seed_spacing
 from msgs_slam.pipelines.mapping.state import KEYS, MapParameters, empty_map
 from msgs_slam.pipelines.render.gaussian_map import decided_channels
@@ -82,29 +81,11 @@ def slanted() -> np.ndarray:
     return (1 / (0.4 + 0.002 * x + 0.001 * y)).astype(np.float32)
 
 
-def test_region_prior_corrects_unreliable_pixels() -> None:
-    truth = slanted()
-    noise = np.random.default_rng(0)
-    weak = np.zeros(truth.shape, bool)
-    weak[20:40, 30:60] = True
-    depth = np.where(weak, truth * noise.uniform(0.7, 1.4, truth.shape), truth).astype(np.float32)
-    reliability = np.where(weak, 0.1, 0.95).astype(np.float32)
-    channels = np.zeros(truth.shape, np.uint8)
-    inverse, trust = with_region_prior(depth, reliability, channels, 0.35)
-    corrected = 1 / inverse
-    error = [np.abs(d / truth - 1)[weak].mean() for d in (corrected, depth)]
-    assert 0 < error[0] < 0.02 < 0.1 < error[1]
-    assert np.abs(corrected / depth - 1)[~weak].max() < 1e-5
-    assert (trust[weak] >= 0.35 / 2).all()
-    assert np.array_equal(trust[~weak], reliability[~weak])
-
-
 def test_unknown_depth_is_filled_and_not_trusted() -> None:
     truth = slanted()
     depth = truth.copy()
     depth[25:35, 35:50] = 0
-    inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
-    completed = complete_depth(inverse, (depth > 0).astype(np.float32))
+    completed = complete_depth(depth, np.ones_like(depth))
     hole = depth == 0
     assert completed.trust[hole].max() == 0
     assert 0 < np.abs(completed.depth / truth - 1)[hole].max() < 0.1

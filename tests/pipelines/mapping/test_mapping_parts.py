@@ -162,8 +162,9 @@ def test_the_map_grows_by_whole_passes(room: MappingInput) -> None:
     settings = MappingConfig(passes=10.0, min_iterations=0)
     schedule = Schedule.plan(room.views, settings, seed=0, seeding=True, passes=None)
     visits = [schedule.step(i) for i in range(schedule.seeding, schedule.total)]
-    assert [i // n for i, s in enumerate(visits) if s.prune] == [0, 3, 5]
+    assert [i // n for i, s in enumerate(visits) if s.prune] == [2, 3, 4, 5]
     assert Counter(i // n for i, s in enumerate(visits) if s.grow) == {2: n, 4: n}
+    assert Counter(i // n for i, s in enumerate(visits) if s.note) == {2: n, 3: n, 4: n, 5: n}
     assert sum(s.coarse for s in visits) == 2 * n
     refining = Schedule.plan(room.views, settings, seed=0, seeding=False, passes=4.0)
     assert not any(s.coarse for s in map(refining.step, range(refining.total)))

@@ -1,12 +1,19 @@
 """Who answers for an error, and what takes the place of a Gaussian that is split."""
 
+from collections.abc import Callable
+from types import SimpleNamespace
+
 import numpy as np
+import pytest
 import torch
 
-from msgs_slam.pipelines.mapping.growth import CHILDREN, DensificationError, densification_error, split
-from msgs_slam.pipelines.render.api import in_view, render
+from msgs_slam.pipelines.config import MappingConfig
+from msgs_slam.pipelines.mapping.growth import CHILDREN, Growth, split
+from msgs_slam.pipelines.mapping.state import MapParameters
+from msgs_slam.pipelines.render.api import render
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.render.inspection import blending_weights
+from msgs_slam.pipelines.render.notes import Notes
 from msgs_slam.pipelines.types import Intrinsics
 
 CAMERA = Intrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0)
@@ -27,43 +34,41 @@ def wall(spacing: float, slope: float = 0.0, radius: float = 0.7) -> GaussianMap
     )
 
 
-def test_blame_is_the_error_weighed_by_the_part_in_the_pixel() -> None:
+def noted(m: GaussianMap, error_of: Callable[[torch.Tensor], torch.Tensor]) -> Notes:
+    notes = Notes()
+    shown = render(m.means, m.radii, m.opacities, m.colors.clone().requires_grad_(), POSE, CAMERA, notes=notes).features
+    notes.errors = error_of(shown.detach())
+    shown.sum().backward()
+    return notes
+
+
+def test_a_gaussian_answers_for_errors_by_its_part_in_the_pixel() -> None:
     m = wall(0.2)
-    everywhere = densification_error(m, POSE, CAMERA, lambda colors: torch.ones(colors.shape[:2]))
+    everywhere = noted(m, lambda colors: torch.ones(colors.shape[:2]))
     weights = blending_weights(m.means, m.radii, m.opacities, POSE, CAMERA)
-    assert torch.allclose(everywhere.error, weights.total, rtol=1e-3, atol=1e-4)
+    assert torch.allclose(everywhere.answered, weights.total, rtol=1e-3, atol=1e-4)
     assert weights.total.max() > 10
 
     def in_the_left_half(colors: torch.Tensor) -> torch.Tensor:
         return (torch.arange(CAMERA.width) < CAMERA.width // 2).float().expand(colors.shape[:2])
 
-    left = densification_error(m, POSE, CAMERA, in_the_left_half).error
+    left = noted(m, in_the_left_half).answered
     assert torch.equal(left[m.means[:, 0] > 0.6], torch.zeros_like(left)[m.means[:, 0] > 0.6])
     inside = m.means[:, 0] < -0.6
-    assert torch.allclose(left[inside], everywhere.error[inside])
+    assert torch.allclose(left[inside], everywhere.answered[inside])
 
 
-def test_blame_is_shown_the_colors_of_the_map() -> None:
-    m, shown = wall(0.2), []
-    densification_error(m, POSE, CAMERA, lambda colors: shown.append(colors) or torch.zeros(colors.shape[:2]))
-    expected = render(m.means, m.radii, m.opacities, m.colors, POSE, CAMERA).features
-    assert torch.allclose(shown[0], expected, atol=1e-5)
-
-
-def test_footprints_are_radii_in_pixels() -> None:
-    m = wall(0.2, radius=0.5)
-    found = densification_error(m, POSE, CAMERA, lambda colors: torch.zeros(colors.shape[:2]))
-    seen = in_view(m.means, m.radii, POSE, CAMERA)
-    assert len(seen) > 0
-    assert torch.allclose(found.footprint[seen], torch.tensor(0.1 / 2 * 60))
-
-
-def test_the_worst_view_counts() -> None:
-    first = DensificationError(torch.tensor([1.0, 5.0]), torch.tensor([3.0, 4.0]))
-    second = DensificationError(torch.tensor([2.0, 0.5]), torch.tensor([6.0, 7.0]))
-    worst = first.worst_of(second)
-    assert worst.error.tolist() == [2.0, 5.0]
-    assert worst.footprint.tolist() == [6.0, 4.0]
+def test_the_worst_view_counts_where_a_gaussian_is_large_enough() -> None:
+    parameters = MapParameters.from_map(wall(1.5))
+    growth = Growth([], 0, MappingConfig(), SimpleNamespace(parameters=parameters), 10.0)
+    rows, large, small = torch.tensor([0, 2]), torch.tensor([3.0, 3.0]), torch.tensor([3.0, 0.5])
+    for answered, footprints in (([1.0, 5.0], large), ([2.0, 9.0], small)):
+        growth.note(Notes(largest=torch.tensor([0.5, 0.1]), answered=torch.tensor(answered)), rows, footprints)
+    assert parameters.noted.tolist() == [[0.5, 2.0], [0.0, 0.0], [pytest.approx(0.1), 5.0], [0.0, 0.0]]
+    parameters.append(wall(1.5), torch.ones(4), weight=1.0)
+    growth.prune(by_weight=True)
+    assert len(parameters) == 6
+    assert not parameters.noted.any()
 
 
 def test_children_lie_on_the_surface_and_cover_what_their_parent_did() -> None:

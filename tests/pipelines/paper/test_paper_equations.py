@@ -283,6 +283,24 @@ def test_16_finds_a_pose_again() -> None:
 # (17) to (20) ---------------------------------------------------------------------------------------------------
 
 
+def test_region_prior_corrects_unreliable_pixels() -> None:
+    y, x = np.mgrid[:60, :80]
+    truth = (1 / (0.4 + 0.002 * x + 0.001 * y)).astype(np.float32)
+    noise = np.random.default_rng(0)
+    weak = np.zeros(truth.shape, bool)
+    weak[20:40, 30:60] = True
+    depth = np.where(weak, truth * noise.uniform(0.7, 1.4, truth.shape), truth).astype(np.float32)
+    reliability = np.where(weak, 0.1, 0.95).astype(np.float32)
+    channels = np.zeros(truth.shape, np.uint8)
+    inverse, trust = mapping.with_region_prior(depth, reliability, channels, 0.35)
+    corrected = 1 / inverse
+    error = [np.abs(d / truth - 1)[weak].mean() for d in (corrected, depth)]
+    assert 0 < error[0] < 0.02 < 0.1 < error[1]
+    assert np.abs(corrected / depth - 1)[~weak].max() < 1e-5
+    assert (trust[weak] >= 0.35 / 2).all()
+    assert np.array_equal(trust[~weak], reliability[~weak])
+
+
 def test_17_unreliable_depth_becomes_that_of_its_region() -> None:
     depth, u = np.full((40, 40), 2, np.float32), np.ones((40, 40), np.float32)
     depth[10:20, 10:20], u[10:20, 10:20] = 3, 0.1

@@ -12,11 +12,10 @@ pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip
 
 from render_scenes import IMAGES, NAMES, random_gaussians, room  # noqa: E402
 
-from msgs_slam.pipelines.compute import gpu  # noqa: E402
 from msgs_slam.pipelines.geometry import se3  # noqa: E402
 from msgs_slam.pipelines.render import cuda, cuda_projection, reference  # noqa: E402
 from msgs_slam.pipelines.render.api import composite, in_view, render  # noqa: E402
-from msgs_slam.pipelines.render.inspection import error_shares  # noqa: E402
+from msgs_slam.pipelines.render.notes import Notes  # noqa: E402
 from tests.card_builds import build  # noqa: E402
 
 DEVICE = "cuda" if ON_CARD else "cpu"
@@ -183,17 +182,21 @@ def test_what_is_in_view_is_marked_as_on_the_cpu():
     assert 20 < len(rows) < 380
 
 
-def test_errors_are_shared_out_by_one_drawing(monkeypatch):
-    """As by drawing and inspecting apart; the errors depend on what is drawn. A few Gaussians of the 20,000 on a card
-    gain or lose a pixel at their rim by rounding, as they do on the CPU between float32 and float64."""
+def test_the_backward_pass_notes_weights_and_errors():
+    """As on the CPU. A few Gaussians of the 20,000 on a card gain or lose a pixel at their rim by rounding, as they do
+    on the CPU between float32 and float64."""
     scene = room(*SIZE, COUNT, 3)
     found = []
-    for takes, device in ((True, DEVICE), (False, "cpu")):
-        monkeypatch.setattr(gpu, "supports_triton", lambda example, takes=takes: takes)
+    for backend, device in (("cuda", DEVICE), ("cpu", "cpu")):
         tensors = [x.to(device) for x in (scene.means, scene.radii, scene.opacities, scene.colors)]
-        found.append(error_shares(*tensors, POSE, scene.intrinsics, lambda colors: (colors - 0.3).abs().mean(-1)))
+        notes = Notes()
+        tensors[3].requires_grad_()
+        shown = render(*tensors, POSE, scene.intrinsics, backend=backend, notes=notes).features
+        notes.errors = (shown.detach() - 0.3).abs().mean(-1)
+        shown.sum().backward()
+        found.append((notes.largest, notes.answered))
     for ours, theirs in zip(*found, strict=True):
-        seen = found[1][0] > 0
+        seen = found[1][1] > 0
         assert seen.any()
         off = (ours.cpu() - theirs)[seen].abs() > 1e-4 + 2e-3 * theirs[seen].abs()
         assert off.double().mean() < 1e-3

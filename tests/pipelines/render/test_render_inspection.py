@@ -11,10 +11,10 @@ from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.render.inspection import (
     blending_weights,
     class_weights,
-    error_shares,
     look,
     median_depth,
 )
+from msgs_slam.pipelines.render.notes import Notes
 
 POSE = torch.eye(4, dtype=torch.float64)
 
@@ -79,15 +79,29 @@ def test_weights_by_class_are_those_of_the_pixels_of_the_class():
     assert (found > 0.01).float().mean(0).min() > 0.05
 
 
-def test_errors_are_shared_as_weights_say():
+def test_the_backward_pass_notes_what_an_inspection_finds():
+    """Of every backend; all pixels count for the largest weight, or half of them."""
     scene = room(90, 70, 2000, 1)
     seen, beside = (scene.means, scene.radii, scene.opacities), (POSE, scene.intrinsics)
-    errors, footprints = error_shares(*seen, scene.colors, *beside, lambda colors: (colors - 0.3).abs().mean(-1))
-    shown = render(*seen, scene.colors, *beside).features
-    weights = blending_weights(*seen, *beside, counts=(shown - 0.3).abs().mean(-1))
-    torch.testing.assert_close(errors, weights.total, rtol=1e-5, atol=1e-6)
-    assert (footprints[errors > 0] > 0).all()
-    assert errors.max() > 0.1
+    weights = blending_weights(*seen, *beside)
+    half = (torch.arange(90) < 45).expand(70, 90)
+    for backend, counted in (("cpu", None), ("cpu", half), ("reference", None), ("reference", half)):
+        notes = Notes(counted)
+        shown = render(*seen, scene.colors.clone().requires_grad_(), *beside, backend=backend, notes=notes).features
+        notes.errors = (shown.detach() - 0.3).abs().mean(-1)
+        shown.sum().backward()
+        answered = blending_weights(*seen, *beside, counts=notes.errors).total
+        torch.testing.assert_close(notes.answered, answered, rtol=1e-4, atol=1e-5)
+        if counted is None:
+            torch.testing.assert_close(notes.largest, weights.largest, rtol=1e-4, atol=1e-5)
+        else:
+            inside = blending_weights(*seen, *beside, counts=half.float()).total
+            assert (notes.largest[inside == 0] == 0).all()
+            assert (notes.largest <= weights.largest + 1e-5).all()
+    assert answered.max() > 0.1
+    shown = render(*seen, scene.colors.clone().requires_grad_(), *beside, notes=Notes()).features
+    with pytest.raises(ValueError, match="errors of the pixels have to be set"):
+        shown.sum().backward()
 
 
 def test_unseen_gaussians_weigh_nothing():
