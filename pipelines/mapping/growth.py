@@ -43,9 +43,9 @@ SPLIT_RADIUS = 1.0
 """Pixels: in a view where a Gaussian is smaller it answers for nothing."""
 SPLIT_ERROR = 0.1
 """Colour error 0..1, summed over a view's pixels: Gaussians that answer for more are split."""
-PRUNE_OPACITY, PRUNE_WEIGHT, PRUNE_RADIUS = 0.03, 0.04, 0.15
-"""Gaussians go that are more transparent than this, of less blending weight in every pixel of every keyframe (a fifth
-fewer at +0.06 dB), or larger than this in units of the scene's median depth."""
+PRUNE_OPACITY, PRUNE_WEIGHT, PRUNE_RADIUS = 0.03, 0.05, 0.15
+"""Gaussians go that are more transparent than this, of less blending weight in every pixel of every visit of a pass (a
+fifth fewer at +0.06 dB), or larger than this in units of the scene's median depth."""
 SPACINGS_ROOM = 50e6
 """Bytes of seed distances that are kept."""
 _SOLID = 0.8
