@@ -105,7 +105,8 @@ class _Composite(torch.autograd.Function):
         inputs, images = saved[:4], saved[4:]
         starts, members, records, features = inputs
         if ctx.notes is not None:
-            ctx.notes.fill(lambda counts: inspect_records(records, *ctx.size[:2], counts, (starts, members)))
+            width, height, _ = ctx.size
+            ctx.notes.fill(lambda counts: inspect_records(records, width, height, counts, (starts, members)))
         upstream = [
             torch.zeros_like(image) if gradient is None else gradient.contiguous()
             for image, gradient in zip(images, gradients, strict=True)

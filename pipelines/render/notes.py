@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -22,8 +22,8 @@ class Notes:
 
     counted: Tensor | None = None
     errors: Tensor | None = None
-    largest: Tensor | None = None
-    answered: Tensor | None = None
+    largest: Tensor = field(init=False)
+    answered: Tensor = field(init=False)
 
     def marks(self) -> NDArray[np.float32]:
         """(2, H, W) errors, and 1 where a pixel counts; raises ValueError where nobody has set the errors."""

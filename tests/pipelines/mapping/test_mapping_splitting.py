@@ -63,7 +63,9 @@ def test_the_worst_view_counts_where_a_gaussian_is_large_enough() -> None:
     growth = Growth([], 0, MappingConfig(), SimpleNamespace(parameters=parameters), 10.0)
     rows, large, small = torch.tensor([0, 2]), torch.tensor([3.0, 3.0]), torch.tensor([3.0, 0.5])
     for answered, footprints in (([1.0, 5.0], large), ([2.0, 9.0], small)):
-        growth.note(Notes(largest=torch.tensor([0.5, 0.1]), answered=torch.tensor(answered)), rows, footprints)
+        notes = Notes()
+        notes.largest, notes.answered = torch.tensor([0.5, 0.1]), torch.tensor(answered)
+        growth.note(notes, rows, footprints)
     assert parameters.noted.tolist() == [[0.5, 2.0], [0.0, 0.0], [pytest.approx(0.1), 5.0], [0.0, 0.0]]
     parameters.append(wall(1.5), torch.ones(4), weight=1.0)
     growth.prune(by_weight=True)
