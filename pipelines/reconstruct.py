@@ -16,7 +16,7 @@ from .engine.tasks import BETWEEN_LOOKS, Shard, SharedWorkers, boards_in
 from .export.inputs import check_export, export_inputs
 from .frames.inputs import check_frames, frames_division, frames_inputs
 from .mapping.division import mapping_division, mapping_inputs
-from .paper.constants import paper_inputs
+from .paper.constants import final_inputs, paper_inputs
 from .proxy.inputs import check_proxy, left_to_auto, proxy_inputs
 from .read_config import with_absolute_paths
 from .run.folder import RunFolder, load_records, load_settings, load_source
@@ -32,13 +32,16 @@ from .system.wording import quoted
 def all_stages(method: str = "default") -> list[Stage]:
     """The stages of a method (`run.method`) in order. Nothing that computes is imported before a stage runs."""
     between = [
-        Stage("tracking", Later("tracking.stage")),
+        Stage("tracking", Later("tracking.stage"), lambda _, config: {"least_piece": config.frames.least_piece}),
         Stage("mapping", Later("mapping.stage"), inputs=mapping_inputs, division=mapping_division),
         Stage("global_ba", Later("global_ba.stage")),
     ]
     if method == "paper":
-        functions = {"tracking": "track", "mapping": "map_keyframes", "global_ba": "close_and_adjust"}
-        between = [Stage(name, Later("paper.stages", function), paper_inputs) for name, function in functions.items()]
+        between = [
+            Stage("tracking", Later("paper.stages", "track"), paper_inputs),
+            Stage("mapping", Later("paper.stages", "map_keyframes"), paper_inputs),
+            Stage("global_ba", Later("paper.stages", "close_and_adjust"), final_inputs),
+        ]
     return [
         Stage(
             "frames", Later("frames.stage"), frames_inputs, check_frames,

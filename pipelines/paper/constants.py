@@ -94,5 +94,10 @@ def constants_of(config: Config) -> Constants:
 
 
 def paper_inputs(source: Path, config: Config) -> dict[str, float]:
-    """Constants come from settings of other stages too."""
-    return asdict(constants_of(config))
+    """Constants come from settings of other stages too, and so does which frames the map is not made from."""
+    return asdict(constants_of(config)) | {"hold_out": config.mapping.hold_out}
+
+
+def final_inputs(source: Path, config: Config) -> dict[str, float]:
+    """The last passes are of images of the size that `mapping.max_side` says."""
+    return paper_inputs(source, config) | {"max_side": config.mapping.max_side}
