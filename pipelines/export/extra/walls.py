@@ -178,8 +178,12 @@ def _strongest_line(faces: _Faces, angle: float) -> _Line:
         away = (faces.centers[near, :2] - place) * np.sqrt(faces.area[near])[:, None]
         along = np.linalg.eigh(away.T @ away)[1][:, 1]
         along = _not_across(along, np.array([normal[1], -normal[0]]))
-        near = np.abs((faces.centers[:, :2] - place) @ (-along[1], along[0])) < 2 * step
-    area = float(faces.area[near].sum())
+        off = (faces.centers[:, :2] - place) @ (-along[1], along[0])
+        if not (here := np.abs(off) < 2 * step).any():  # between a wall and what stands before it: on with the larger
+            before, all_of = near & (off > 0), float(faces.area[near].sum())
+            here = before if faces.area[before].sum() > all_of / 2 else near & (off <= 0)
+        near = here
+    area = float(faces.area[np.abs(off) < 2 * step].sum())
     return _Line(area if area > least else 0.0, angle, place, along)
 
 

@@ -74,6 +74,19 @@ def test_a_bay_window_does_not_take_the_walls_beside_it() -> None:
     assert seen == len(walls) == len(BAY) - 1  # one of the two pieces of 25 cm is missed
 
 
+@pytest.mark.parametrize("deep", [0.18, 0.19, 0.195, 0.2])
+@pytest.mark.parametrize("top", [1.2, 1.3, 1.4])
+def test_a_long_shelf_before_a_wall_is_no_riddle(deep: float, top: float) -> None:
+    """Two surfaces of about one size, some four steps apart: the line between them lies on neither."""
+    front = [sheet(np.array([0.0, deep]), np.array([6.4, deep]), 0, top)]
+    walls = [sheet(ROOM[k], ROOM[(k + 1) % 6], top if k == 0 else 0, 2.6) for k in range(6)]
+    mesh = trimesh.util.concatenate(front + walls)
+    mesh.vertices += np.random.default_rng(0).normal(size=mesh.vertices.shape) * 0.001
+    found = find_walls(mesh.vertices, mesh.faces)
+    assert len(found) == 6
+    assert found[0].length == pytest.approx(6.4, rel=0.02)
+
+
 def test_pieces_far_apart_are_no_wall() -> None:
     """Two short sheets that happen to stand in line, in the middle of nothing."""
     sheets = [sheet(ROOM[k], ROOM[(k + 1) % 6], 0, 2.6) for k in range(6)]
