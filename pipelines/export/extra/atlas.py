@@ -52,6 +52,8 @@ def simplified(mesh: MeshArrays, share: float = SHARE) -> MeshArrays:
         points, faces = simplify(mesh.vertices, mesh.faces, target_count=max(int(wanted), _FEWEST), agg=_SMOOTH)
         points = points.astype(np.float32)
         used, renumbered = np.unique(faces[_areas(points, faces) > 0], return_inverse=True)
+        if len(used) == 0:
+            return mesh  # it has no area at all
         if len(used) <= most:
             break
         wanted *= 0.99 * most / len(used)
@@ -65,14 +67,15 @@ def unwrapped(mesh: MeshArrays, texels_per_unit: float, most: int) -> Atlas:
     """The mesh cut into charts that lie flat beside each other, in an image of at most that many texels a side."""
     import xatlas
 
-    area = _areas(mesh.vertices, mesh.faces).sum()
-    side = min(float(np.sqrt(area / _FILLED)) * texels_per_unit, 0.97 * most)
+    # xatlas takes faces for nothing whose area is below 1e-7, whatever the unit: with this one they are 1 on the whole.
+    scale = np.float32(1 / np.sqrt(_areas(mesh.vertices, mesh.faces).mean().clip(1e-30)))
+    square = float(np.sqrt(len(mesh.faces) / _FILLED))
     packing = xatlas.PackOptions()
-    packing.texels_per_unit, packing.padding = side / float(np.sqrt(area / _FILLED)), _GUTTER
+    packing.texels_per_unit, packing.padding = min(texels_per_unit / float(scale), 0.97 * most / square), _GUTTER
     atlas, parts = xatlas.Atlas(), _parts(mesh)
     vertices_of = [np.unique(mesh.faces[part], return_inverse=True) for part in parts]
     for used, renumbered in vertices_of:
-        atlas.add_mesh(mesh.vertices[used], renumbered.reshape(-1, 3).astype(np.uint32))
+        atlas.add_mesh(scale * mesh.vertices[used], renumbered.reshape(-1, 3).astype(np.uint32))
     atlas.generate(pack_options=packing)
     pieces = [atlas[i] for i in range(len(parts))]
     vertex = np.concatenate([used[own] for (used, _), (own, _, _) in zip(vertices_of, pieces, strict=True)])
@@ -81,7 +84,9 @@ def unwrapped(mesh: MeshArrays, texels_per_unit: float, most: int) -> Atlas:
     for part, first, (_, of_part, _) in zip(parts, firsts, pieces, strict=False):
         faces[part] = of_part + first
     uv = np.concatenate([of_part for _, _, of_part in pieces])
-    shrunk = min(most / max(atlas.width, atlas.height), 1.0)  # how well charts fill a square is known afterwards only
+    shrunk = min(
+        most / max(atlas.width, atlas.height, 1), 1.0
+    )  # how well charts fill a square is known afterwards only
     width, height = max(int(atlas.width * shrunk), 1), max(int(atlas.height * shrunk), 1)
     corners = uv * np.array([width, height], np.float64)
     return Atlas(mesh, corners, vertex.astype(np.int64), faces, width, height)

@@ -186,6 +186,23 @@ def test_threads_do_not_change_a_byte(atlas: Atlas, painted: NDArray[np.uint8]) 
         set_threads(before)
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_charts_do_not_depend_on_the_unit(atlas: Atlas, unit: float) -> None:
+    other = unwrapped(replace(atlas.mesh, vertices=atlas.mesh.vertices * np.float32(unit)), 150 / unit, 4096)
+    same = unwrapped(atlas.mesh, 150, 4096)
+    assert (other.width, other.height) == pytest.approx((same.width, same.height), rel=0.02)
+    assert len(np.unique(owners(other))) == len(np.unique(owners(same))) > 0.9 * len(atlas.mesh.faces)
+
+
+def test_a_mesh_without_any_area_has_a_texture_too() -> None:
+    """Of six points on a line: nothing to see, and nothing that ends an export."""
+    points = np.arange(21, dtype=np.float32).reshape(7, 3) * [1, 0, 0]
+    faces = np.arange(5, dtype=np.int32)[:, None] + np.arange(3, dtype=np.int32)
+    line = MeshArrays(points.astype(np.float32), faces, np.full((7, 3), 9, np.uint8), np.zeros(7, np.uint8))
+    flat = unwrapped(simplified(line), 100.0, 4096)
+    assert paint_texture(flat, SHOTS[:1], SilentProgress()).shape == (flat.height, flat.width, 3)
+
+
 def test_the_side_is_kept(atlas: Atlas) -> None:
     small = unwrapped(atlas.mesh, 1e4, 200)
     assert 150 < max(small.width, small.height) <= 200
