@@ -149,6 +149,12 @@ Axes: the run's own, about those of the first posed camera: x right, y down, z f
 _FREE = "The unit of lengths is free: one camera cannot measure metres. Metric depth or --scale-ref makes them metres."
 
 
+def names_of(only: str | None = None) -> list[str]:
+    """Names in the folder of an export of all files, or of one of the `EXPORTS`."""
+    parts = [part for e in _ENTRIES if only is None or e.kind in (only, "*") for part in e.name.split(", ")]
+    return ["README.txt", *(f"mesh{p}" if p.startswith(".") else p.split("/")[0] for p in parts)]
+
+
 def lengths(metres: Metres | None, metric: bool) -> str:
     """Describe the unit of length in a line or two of plain text."""
     if metres is None:

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ...formats.errors import InputError
 from ...formats.mesh import mesh_blocks
 from ..config import ExportConfig
 from ..engine.stages import StageContext
@@ -19,16 +20,30 @@ from ..scene.gps import world_on_earth
 from ..scene.metres import find_metres
 from ..scene.upright import find_upright
 from ..scene.world import FIRST, WORLD, World, upright_world, world_figures
+from ..source.opening import is_of_source
 from ..system.memory import release_free_memory
 from ..system.progress import Progress, SilentProgress
 from ..types import Metres
 from .extra.floor_plan import write_floor_plan
 from .extra.meshes import write_collision, write_usd
-from .extra.tiles import write_tiles
+from .extra.tiles import TILES, TILESET, write_tiles
 from .extra.web_page import write_web_page
 from .mesh import MeshJob, mesh_figures, write_meshes
 from .pieces import write_pieces
-from .writers import write_colmap, write_notes, write_ply, write_readme, write_splats, write_trajectory, write_world
+from .readme import names_of
+from .writers import (
+    IMAGES,
+    write_colmap,
+    write_notes,
+    write_ply,
+    write_readme,
+    write_splats,
+    write_trajectory,
+    write_world,
+)
+
+_SEVERAL = ("colmap", "ply", "mesh", "obj")
+"""The `EXPORTS` of more than one file."""
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -132,8 +147,10 @@ def export_run(
 ) -> list[Path]:
     """Write one of the `EXPORTS`, or with None all, of a run into a folder; returns what was written.
 
-    Settings are the run's own where none are given. Raises InputError for a run without a map.
+    Settings are the run's own where none are given. Raises InputError for a run without a map, and for a folder that
+    holds such files of somebody else, or the run's source.
     """
+    _require_own(run, folder, only)
     found = load_outcome(run)
     found.require_map()
     settings = settings or found.config.export
@@ -164,12 +181,31 @@ def export_run(
         "floorplan": lambda: write_floor_plan(found, folder),
         "tum": lambda: write_trajectory(outcome, folder),
     }
+    if only in (None, *_SEVERAL):  # by it the folder is known for an export's, should this be stopped
+        write_world(outcome, world, folder)
     if only:
         paths = [*writers[only](), write_world(outcome, world, folder)]
         # The run's own folder has a README that tells of every kind.
         own = folder.resolve() == run.stage("export").resolve()
         return paths if own else [*paths, write_readme(outcome, world, folder, only)]
     return write_all_but_mesh(outcome, world, settings, folder) + mesh("mesh")
+
+
+def _require_own(run: RunFolder, folder: Path, only: str | None) -> None:
+    """Nothing that the user has is overwritten: photographs, another program's data set, a README of his own."""
+    if folder.resolve() == run.stage("export").resolve():
+        return
+    names = names_of(only)
+    if IMAGES in names and is_of_source(folder / IMAGES, run):
+        raise InputError(f"{folder / IMAGES} is the source of {run.root}: name another folder with --to")
+    # Tiles that were stopped have no tileset yet.
+    entries = {name: folder / name for name in names} | {TILES: folder / TILES / TILESET}
+    taken = [name for name in names if entries[name].exists()]
+    if taken and not (folder / WORLD.name).is_file():
+        raise InputError(
+            f"{folder} holds {', '.join(taken)} already, which is of no export (without {WORLD.name}): name another "
+            "folder with --to"
+        )
 
 
 def _kept_world(outcome: Outcome, settings: ExportConfig) -> World | None:

@@ -14,6 +14,7 @@ from ...formats.images import is_depth_map
 from ...formats.reading import file_sha256, files_sha256, opened, reaching, require_file
 from ...formats.textfile import read_text
 from ...formats.video import VideoFrame, VideoReader, probe_video
+from ..run.folder import RunFolder
 from .recording import ImageSource, RecordingSource, Warn, open_recording, require_size
 
 LIST_SUFFIX = ".videos"
@@ -173,6 +174,15 @@ def source_digest(source: Path, format: str) -> str:
         return file_sha256(source) if files == (source,) else files_sha256((str(i), f) for i, f in enumerate(files))
     images, times = list_images(source), times_file(source)
     return files_sha256(sorted((p.name, p) for p in [*images, *([times] if times else [])]))
+
+
+def is_of_source(path: Path, run: RunFolder) -> bool:
+    """Return whether something that exists is a video that a run was made from, its folder of images, or in that."""
+    if (manifest := run.manifest()) is None or not path.exists():
+        return False
+    source = Path(manifest.source.path)
+    files = video_files(source) if source.is_file() else (source,)
+    return any(path.resolve().is_relative_to(file.resolve()) for file in files)
 
 
 def _require_one_size(folder: Path, sizes: dict[str, tuple[int, int]], what: str) -> None:

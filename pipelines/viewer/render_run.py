@@ -26,6 +26,7 @@ from ..evaluation.views import (
 from ..outcome import Outcome, load_outcome
 from ..run.folder import RunFolder
 from ..scene.world import WORLD, up_in_run
+from ..source.opening import is_of_source
 from ..system.progress import Progress, SilentProgress, log
 from ..system.wording import quoted
 from ..types import Intrinsics
@@ -73,6 +74,8 @@ def render_run(
         raise InputError(f"kind is one of {', '.join(KINDS)}; got {kind!r}")
     rate = 30.0 if fps is None else fps
     _require_target(target, rate)
+    if is_of_source(target, run):
+        raise InputError(f"{target} is the source of {run.root}: name another file or folder")
     given = _given_path(path, fps)
     flown = None if given is None else _in_world_of_run(given, run)
     outcome = load_outcome(run)

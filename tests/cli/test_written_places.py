@@ -5,13 +5,15 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
-from cli_runs import FinishedRun, elsewhere, files_below
+from cli_runs import FinishedRun, elsewhere, files_below, invoke
 
 from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.run import files
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
+from msgs_slam.pipelines.run.manifest import Source, read_manifest, write_manifest
 from msgs_slam.pipelines.run.schema import RunFile
 
 ALL_OF_THEM = """
@@ -53,6 +55,33 @@ def test_nothing_is_written_elsewhere(
     assert {p.name for p in run.iterdir() if p.name not in {q.name for q in finished_run.folder.iterdir()}} == {
         "evaluation"
     }
+
+
+def test_what_the_user_has_is_not_overwritten(
+    finished_run: FinishedRun, copied_run: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """Photographs beside which a data set is wanted, the video in the place of the film, files of one's own."""
+    run, photos, site = copied_run("run.msgs"), tmp_path / "scene" / "images", tmp_path / "site"
+    for mine in (photos / "000000.jpg", site / "README.txt", site / "tiles" / "tile.png"):
+        mine.parent.mkdir(parents=True, exist_ok=True)
+        mine.write_text("mine")
+    before = files_below(tmp_path / "scene", site, finished_run.video.parent)
+    refused = invoke("render", run, finished_run.video)
+    assert (refused.exit_code, "is the source of" in refused.stderr) == (1, True)
+    manifest = read_manifest(run / "manifest.json")
+    write_manifest(run / "manifest.json", replace(manifest, source=Source(str(photos), manifest.source.digest)))
+    for words in (("render", run, photos), ("export", run, "--only", "nerfstudio", "--to", photos.parent)):
+        refused = invoke(*words)
+        assert (refused.exit_code, "is the source of" in refused.stderr) == (1, True)
+    refused = invoke("export", run, "--only", "html", "--to", site)
+    assert (refused.exit_code, "holds README.txt already" in refused.stderr) == (1, True)
+    assert files_below(tmp_path / "scene", site, finished_run.video.parent) == before
+
+    (site / "README.txt").unlink()
+    for kind in ("html", "tiles", "tiles"):
+        assert invoke("export", run, "--only", kind, "--to", site).exit_code == 0
+    assert (site / "tiles" / "tile.png").read_text() == "mine"
+    assert (site / "tiles" / "tileset.json").is_file()
 
 
 ROWS: list[RunFile] = [*files.FIGURES.values(), *(row for row in vars(files).values() if isinstance(row, RunFile))]

@@ -4,7 +4,7 @@ A binary tree: the Gaussians are halved along the longest side until a tile is s
 its two halves with fewer, larger Gaussians (`merged`). The file format is that of `write_compressed_glb`.
 """
 
-import shutil
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from ....formats.gps import ecef_from_enu
 from ....formats.splats import COMPRESSION, EXTENSION, write_compressed_glb
 from ....formats.textfile import write_json
 from ...outcome import Outcome
-from ...run.ending import empty
 from ...scene.world import Z_UP_FROM_Y_DOWN, World
 
 Array = NDArray[np.float64]
@@ -41,7 +40,7 @@ _WIDEST = 0.5
 def write_tiles(outcome: Outcome, world: World, folder: Path) -> list[Path]:
     """tiles/tileset.json and its tiles; nothing where there are no Gaussians. `outcome` stands in `world`.
 
-    tileset.json is written last, and the folder is removed where one of the files cannot be written. Raises
+    tileset.json is written last, and the tiles are removed where one of the files cannot be written. Raises
     DiskFullError before anything is made where there is no room for it.
     """
     m = outcome.require_map()
@@ -50,7 +49,7 @@ def write_tiles(outcome: Outcome, world: World, folder: Path) -> list[Path]:
     require_room(folder / TILES, _MIN_BYTES * len(m))
     means, log_radii, logits, colors = (x.cpu().numpy() for x in (m.means, m.log_radii, m.opacity_logits, m.colors))
     cloud = isotropic_cloud((means @ world.image_axes_from_exported.T).astype(np.float32), log_radii, logits, colors)
-    empty(target := folder / TILES)
+    _clear(target := folder / TILES)
     try:
         root, _ = _write_tile(cloud, target, "tile")
         root["refine"], root["transform"] = "REPLACE", _earth_from_tiles(outcome, world).ravel(order="F").tolist()
@@ -64,9 +63,17 @@ def write_tiles(outcome: Outcome, world: World, folder: Path) -> list[Path]:
         }
         write_json(target / TILESET, document)
     except BaseException:
-        shutil.rmtree(target, ignore_errors=True)
+        _clear(target)
         raise
     return [target]
+
+
+def _clear(folder: Path) -> None:
+    """Remove the tiles of an earlier export; what else lies there is somebody's."""
+    for old in [folder / TILESET, *folder.glob("tile*.glb")]:
+        old.unlink(missing_ok=True)
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def _write_tile(cloud: GaussianCloud, folder: Path, name: str) -> tuple[dict[str, Any], GaussianCloud]:
