@@ -78,6 +78,10 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | No
 @verbosity_options
 def report(run_path: Path, to: Path | None, pdf: bool, output: Output) -> None:
     """Write one HTML file that says what was found, how good it is, and what to film better."""
+    if to is not None and to.suffix.lower() == ".pdf":
+        raise click.UsageError(
+            f"--to {to}: it names the HTML file, {to.with_suffix('.html')}; with --pdf the PDF is made beside it"
+        )
     run = open_run(run_path)
     from ..pipelines.evaluation.html import find_browser, print_pdf
     from ..pipelines.evaluation.report import write_report

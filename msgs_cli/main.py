@@ -233,6 +233,27 @@ def resume(
 
 @main.command()
 @RUN_ARGUMENT
+@click.argument("videos", metavar="VIDEO...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@verbosity_options
+def extend(run_path: Path, videos: tuple[Path, ...], output: Output) -> None:
+    """Add VIDEO, by the same camera and of the same place, to the finished RUN.
+
+    First a few of its images are searched for in the run: if nothing matches or the camera differs, it stops and
+    changes nothing. Then its frames join those of the run, whose poses are the start, all are adjusted together, and
+    the map is grown where the added frames look. Coordinates stay what they were, as near as the adjustment allows.
+    Stopped, the same command or `msgs-slam resume RUN` goes on.
+    """
+    from ..pipelines.reconstruct import extend as extend_run
+    from ..pipelines.run.folder import RunFolder
+
+    run = RunFolder(run_path)
+    with output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"):
+        records = extend_run(run, videos, output.progress())
+    report_run(output, run.root, records)
+
+
+@main.command()
+@RUN_ARGUMENT
 @click.option(
     "--only", type=KindOfFile([*EXPORTS, *_COMES_WITH]),
     help="Write one kind of file only; nerfstudio's comes with colmap. Default: all.",
@@ -258,6 +279,11 @@ def export(
     """
     if (config_file or overrides) and to is None:
         raise click.UsageError("add --to DIR: files of other settings (--set, --config) do not go into the run")
+    if others := [text for text in overrides if not text.startswith("export.")]:
+        raise click.UsageError(
+            f"--set {others[0]}: an export has the settings of [export] alone; of the rest of the run: "
+            f"msgs-slam resume {quoted(run_path)} --set {quoted(others[0])}"
+        )
     from ..pipelines.read_config import load_config
     from ..pipelines.reconstruct import made_with
 
@@ -342,24 +368,3 @@ main.add_command(doctor)
 
 if __name__ == "__main__":
     main()
-
-
-@main.command()
-@RUN_ARGUMENT
-@click.argument("videos", metavar="VIDEO...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@verbosity_options
-def extend(run_path: Path, videos: tuple[Path, ...], output: Output) -> None:
-    """Add VIDEO, by the same camera and of the same place, to the finished RUN.
-
-    First a few of its images are searched for in the run: if nothing matches or the camera differs, it stops and
-    changes nothing. Then its frames join those of the run, whose poses are the start, all are adjusted together, and
-    the map is grown where the added frames look. Coordinates stay what they were, as near as the adjustment allows.
-    Stopped, the same command or `msgs-slam resume RUN` goes on.
-    """
-    from ..pipelines.reconstruct import extend as extend_run
-    from ..pipelines.run.folder import RunFolder
-
-    run = RunFolder(run_path)
-    with output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"):
-        records = extend_run(run, videos, output.progress())
-    report_run(output, run.root, records)

@@ -150,7 +150,7 @@ def resume(
     require_run(run)
     if run.is_piece:
         raise InputError(
-            f"{run.root} is a piece of {run.root.parent}: run `msgs-slam resume {quoted(run.root.parent)}`"
+            f"{run.root} is a piece of {run.place.parent}: run `msgs-slam resume {quoted(run.place.parent)}`"
         )
     origin = load_source(run)
     source = Path(origin.path)

@@ -87,7 +87,7 @@ def evaluate_outcome(
         measured = measure_views(outcome, matched, alignment, matching, progress or SilentProgress(), max_views)
         of_map = measured.cells(outcome, matched)
     result = {
-        "run": outcome.run.root.name,
+        "run": outcome.run.place.name,
         "truth": f"{truth.root.name} ({truth.format})",
         "stage": {"poses": outcome.pose_stage, "map": outcome.map_stage or "none"},
         "protocol": [line.format(by=matched.by) for line in PROTOCOL],

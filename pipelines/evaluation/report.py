@@ -85,7 +85,7 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
             _settings_section(outcome),
         ]
     )
-    write_text(target, page(f"{run.root.name} – report", body))
+    write_text(target, page(f"{run.place.name} – report", body))
     return target
 
 
@@ -112,7 +112,7 @@ def _heading(outcome: Outcome) -> str:
     pairs.append(("seconds", f"{sum(r.seconds for r in outcome.records.values()):.0f}"))
     source = escape(str(load_source(outcome.run).path))
     after = _AFTER.get(outcome.map_stage or outcome.pose_stage, "")
-    return f'<h1>{escape(outcome.run.root.name)}</h1><p class="sub">Source: {source}{after}</p>{chips(pairs)}'
+    return f'<h1>{escape(outcome.run.place.name)}</h1><p class="sub">Source: {source}{after}</p>{chips(pairs)}'
 
 
 def _page_link(run: RunFolder, report: Path) -> str:
@@ -193,7 +193,7 @@ def _piece_section(piece: Outcome, progress: Progress) -> str:
     views = None if piece.gaussian_map is None else render_views(piece, progress)
     t = piece.trajectory
     seconds = f"{t.timestamps[0]:.1f} to {t.timestamps[-1]:.1f}"
-    name = piece.run.root.name
+    name = piece.run.place.name
     return section(
         f"Apart from the rest: {name.replace('_', ' ')}",
         chips([*_figures(piece), ("seconds of the source", seconds)]),

@@ -22,7 +22,7 @@ from ..scene.upright import find_upright
 from ..scene.world import FIRST, WORLD, World, upright_world, world_figures
 from ..source.opening import is_of_source
 from ..system.memory import release_free_memory
-from ..system.progress import Progress, SilentProgress
+from ..system.progress import Progress, SilentProgress, log
 from ..types import Metres
 from .extra.floor_plan import write_floor_plan
 from .extra.meshes import write_collision, write_usd
@@ -154,7 +154,10 @@ def export_run(
     found = load_outcome(run)
     found.require_map()
     settings = settings or found.config.export
-    world = _kept_world(found, settings) or find_world(found, settings)[0]
+    if (world := _kept_world(found, settings)) is None:
+        world, reasons = find_world(found, settings)
+        for reason in reasons:
+            log.warning(reason)
     outcome = on_earth(found.moved(world.exported_from_run), world)
     if outcome.metres is not None and outcome.metres.is_guess and settings.scale == "free":
         outcome = replace(outcome, metres=None)

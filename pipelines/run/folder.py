@@ -10,6 +10,7 @@
 into the folder of the running stage (`RunFile.save`). The table of the files is `run/files.py`.
 """
 
+import os
 from dataclasses import dataclass, field, fields, replace
 from itertools import count, takewhile
 from pathlib import Path, PurePosixPath
@@ -51,6 +52,11 @@ class RunFolder:
     root: Path
     _manifest: dict[Stamp, Manifest] = field(default_factory=dict, init=False, compare=False, repr=False)
     _digests: dict[Path, tuple[Stamp, str]] = field(default_factory=dict, init=False, compare=False, repr=False)
+
+    @property
+    def place(self) -> Path:
+        """The folder's whole path, which has a name: "." has none."""
+        return Path(os.path.abspath(self.root))
 
     def stage(self, name: str) -> Path:
         """Folder of a finished stage."""
@@ -132,7 +138,7 @@ class RunFolder:
     @property
     def is_piece(self) -> bool:
         """Whether this is a run inside another one."""
-        return self.root.name.startswith("piece_") and RunFolder(self.root.parent).manifest_file.exists()
+        return self.place.name.startswith("piece_") and RunFolder(self.place.parent).manifest_file.exists()
 
     def _is_intact(self, path: Path, size: int, digest: str) -> bool:
         try:

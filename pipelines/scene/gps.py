@@ -38,7 +38,7 @@ def world_on_earth(outcome: Outcome, world: World, gps: str) -> tuple[World, str
     if gps == GPS_OFF:
         return world, ""
     places = _exif_places(outcome) if gps == GPS_AUTO else _track_places(outcome, _track(gps))
-    found = _laid_out(outcome, world, places)
+    found = places if isinstance(places, str) else _laid_out(outcome, world, places)
     if isinstance(found, World):
         return found, ""
     log.info("not georeferenced: %s", found)
@@ -74,13 +74,18 @@ def _exif_places(outcome: Outcome) -> Array:
     return photo_places([source.file(frame.source_index) for frame in outcome.frames])
 
 
-def _track_places(outcome: Outcome, track: Track) -> Array:
-    """By time. A video counts from its beginning: a track of another day is taken to begin with it."""
+def _track_places(outcome: Outcome, track: Track) -> Array | str:
+    """By time, or in words why not. A video counts from its beginning: a track of another day is taken to begin with
+    it. What lies between two fixes is no fix."""
     times = np.array([frame.timestamp for frame in outcome.frames])
     if times[-1] < track.times[0] or times[0] > track.times[-1]:
         track = replace(track, times=track.times - track.times[0] + times[0])
     step = float(np.median(np.diff(track.times))) if len(track.times) > 1 else 0.0
-    return track.at(times, max(_MIN_GAP, step))
+    farthest = max(_MIN_GAP, step)
+    fixes = int(((times[0] - farthest <= track.times) & (track.times <= times[-1] + farthest)).sum())
+    if fixes < _MIN_FIXES:
+        return f"only {fixes} of its fixes are of the time of the recording, {_MIN_FIXES} are needed"
+    return track.at(times, farthest)
 
 
 def georeference(centers: Array, places: Array, metric: bool) -> tuple[Similarity, Georeference] | str:

@@ -153,7 +153,7 @@ def _from_run(outcome: Outcome) -> ViewerScene:
     world_from_cam = t.world_from_cam
     channels = decided_channels(m.class_logits).cpu().numpy()
     return ViewerScene(
-        title=f"{run.root.parent.name}, {run.root.name.replace('_', ' ')}" if run.is_piece else run.root.name,
+        title=f"{run.place.parent.name}, {run.place.name.replace('_', ' ')}" if run.is_piece else run.place.name,
         cloud=cloud,
         scale=scale,
         up=up if world is None else world.exported_from_run.rotation @ up,
@@ -208,7 +208,7 @@ def _of_points(
         points.astype(np.float32), np.float32(np.log(_POINT_RADIUS / scale)) * ones, np.float32(opacity) * ones,
         (colors / 255).astype(np.float32),
     )  # fmt: skip
-    shown = ViewerScene(run.root.name, cloud, scale, up, run=run, world=RUN, what=POINTS, is_empty=is_empty)
+    shown = ViewerScene(run.place.name, cloud, scale, up, run=run, world=RUN, what=POINTS, is_empty=is_empty)
     if not cameras:
         return shown
     frames, k = run.load(FRAMES), run.load(CALIBRATION).intrinsics

@@ -265,6 +265,20 @@ def test_export_with_other_settings_must_say_where_to(tmp_path: Path) -> None:
     assert "--to" in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("export", "--to", "x", "--set", "mapping.passes=3"), "msgs-slam resume no.msgs --set mapping.passes=3"),
+        (("report", "--to", "report.pdf"), "report.html; with --pdf"),
+        (("report", "--to", "report.PDF", "--pdf"), "report.html; with --pdf"),
+    ],
+)
+def test_options_that_would_do_nothing_or_something_else_are_refused(words: tuple[str, ...], reason: str) -> None:
+    result = invoke(words[0], "no.msgs", *words[1:])
+    assert result.exit_code == 2
+    assert reason in " ".join(result.stderr.split())
+
+
 def test_a_class_map_that_is_none_is_refused_before_the_run_is_looked_at(tmp_path: Path) -> None:
     result = invoke("evaluate", tmp_path / "no.msgs", "--truth", tmp_path, "--class-map", "mine.toml")
     assert result.exit_code == 1

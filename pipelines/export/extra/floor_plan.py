@@ -57,7 +57,7 @@ def write_floor_plan(outcome: Outcome, folder: Path) -> list[Path]:
     if world.earth is None and not outcome.metric and (metres := outcome.metres) is not None:
         per_unit, spread, about = metres.per_unit, metres.relative_sd, metres.text
     unit = "m" if about or outcome.metric or world.earth is not None else "units"
-    text = floor_plan(walls, moved.centers[moved.is_placed], outcome.run.root.stem, per_unit, unit, about, spread)
+    text = floor_plan(walls, moved.centers[moved.is_placed], outcome.run.place.stem, per_unit, unit, about, spread)
     write_text(folder / FLOOR_PLAN, text)
     return [folder / FLOOR_PLAN]
 

@@ -133,7 +133,7 @@ def _unit(outcome: Outcome, world: World) -> dict[str, Any]:
 def _title(run: RunFolder) -> str:
     """The source's name: that of the run's folder would give two runs of one source other bytes."""
     manifest = run.manifest()
-    return run.root.stem if manifest is None else Path(manifest.source.path).stem
+    return run.place.stem if manifest is None else Path(manifest.source.path).stem
 
 
 def _page(title: str, about: dict[str, Any], packed: bytes) -> str:

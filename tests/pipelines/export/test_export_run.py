@@ -172,6 +172,16 @@ def test_rest_coefficients_on_request(run: RunFolder, tmp_path: Path) -> None:
     assert not vertex["f_rest_44"].any()
 
 
+def test_a_track_that_says_too_little_is_warned_of(
+    run: RunFolder, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Between two fixes any number of places can be interpolated, and an export elsewhere has no record to warn in."""
+    (tmp_path / "track.csv").write_text("time,lat,lon\n0,50,10\n1,50.001,10\n")
+    export_run(run, tmp_path / "out", "tum", settings=ExportConfig(gps=str(tmp_path / "track.csv")))
+    assert "not georeferenced: only 2 of its fixes are of the time of the recording" in caplog.text
+    assert WORLD.read(tmp_path / "out" / "world.json").earth is None
+
+
 def test_a_run_without_a_map_is_refused(oracle_run: OracleRun, tmp_path: Path) -> None:
     run = oracle_run()
     (run.stage("mapping") / "map.safetensors").unlink()

@@ -84,3 +84,13 @@ def test_a_manifest_of_another_format_is_refused(run: RunFolder) -> None:
         run.manifest_file.write_text(json.dumps(value | {"format": format}))
         with pytest.raises(InputError, match=f"its format is {format}, this version of the program knows 2"):
             load_records(RunFolder(run.root))
+
+
+def test_the_working_folder_is_a_run_with_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`cd both.msgs/piece_2; msgs-slam resume .`: a piece has to be known there, and titles take its name."""
+    (tmp_path / "both.msgs" / "piece_2").mkdir(parents=True)
+    (tmp_path / "both.msgs" / "manifest.json").write_text("{}")
+    monkeypatch.chdir(tmp_path / "both.msgs" / "piece_2")
+    for path, name in ((".", "piece_2"), ("..", "both.msgs")):
+        run = RunFolder(Path(path))
+        assert (run.place.name, run.is_piece) == (name, path == ".")
