@@ -62,7 +62,9 @@ def find_recordings(folder: Path, runs: Path) -> list[Recording]:
     if not sources:
         raise InputError(f"{folder} holds no video, image folder or data set")
     stems = [p.stem if p.is_file() else p.name for p in sources]
-    names = [stem if stems.count(stem) == 1 else p.name for stem, p in zip(stems, sources, strict=True)]
+    files = {p.name for p in sources if p.is_file()}
+    clear = [stems.count(stem) == 1 and stem not in files for stem in stems]
+    names = [stem if is_clear else p.name for stem, is_clear, p in zip(stems, clear, sources, strict=True)]
     return [Recording(n, p, runs / f"{n}.msgs") for n, p in zip(names, sources, strict=True)]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -289,7 +290,7 @@ def find_class_table(label_folder: Path) -> Path | None:
 
 def read_class_table(path: Path) -> dict[int, LabelClass]:
     """id → class. JSON: {"classes": [{"id", "name", "color"?}]}, such a list, a list of names, or {"id": "name"};
-    text: a name a line (ids from 0) up to the first empty line, or `id name [anything]` a line; # begins a comment.
+    text: a name a line (ids from 0) up to the first empty line, or `id name [numbers]` a line; # begins a comment.
     Raises InputError.
     """
     stored = read_json(path, _MAX_TABLE_BYTES) if path.suffix == ".json" else read_text(path, _MAX_TABLE_BYTES)
@@ -323,13 +324,21 @@ def _class_of(row: Any) -> LabelClass:
 
 
 def _from_text(text: str) -> dict[int, LabelClass]:
-    lines = [line.split("#")[0].strip() for line in text.strip().splitlines() if not line.startswith("#")]
+    lines = [line.split("#")[0].strip() for line in text.strip().splitlines() if line.lstrip()[:1] != "#"]
     # Prose may follow the names after an empty line, as in the lists that come with some networks.
     lines = lines[: lines.index("")] if "" in lines else lines
     rows = [line.split() for line in lines]
     if all(len(r) >= 2 and r[0].isdecimal() for r in rows):
-        return {int(r[0]): LabelClass(int(r[0]), r[1]) for r in rows}
+        return {int(r[0]): LabelClass(int(r[0]), " ".join(takewhile(_is_word, r[1:])) or r[1]) for r in rows}
     return {i: LabelClass(i, line) for i, line in enumerate(lines)}
+
+
+def _is_word(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return True
+    return False
 
 
 def find_label_table(path: Path) -> Path | None:

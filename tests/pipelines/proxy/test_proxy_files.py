@@ -203,6 +203,8 @@ def test_only_void_or_too_many_classes_are_refused(source: Path, room: Room) -> 
         ("classes.json", '{"classes": [{"id": 7, "name": "bed"}]}', {7: "bed"}),
         ("classes.json", '{"3": "lamp"}', {3: "lamp"}),
         ("classes.txt", "# id name\n93 wall 0.3\n0 void 0.2\n", {93: "wall", 0: "void"}),
+        ("classes.txt", "28 shower curtain 0.3 x\n7\ttraffic light\n", {28: "shower curtain", 7: "traffic light"}),
+        ("labels.txt", "wall\n  # indented\nfloor # here\nbed\n", {0: "wall", 1: "floor", 2: "bed"}),
         ("labels.txt", "background\npotted plant\n\nprose follows\n", {0: "background", 1: "potted plant"}),
     ],
 )
