@@ -1,6 +1,7 @@
 """The images of a folder: which they are, their order, and when they were taken."""
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -69,9 +70,9 @@ def read_image_times(images: list[Path]) -> NDArray[np.float64] | None:
     """Read (N,) seconds at which the images were taken, strictly increasing; None where they are unknown.
 
     Looks for timestamps.txt, times.txt or rgb.txt in the images' folder, then in the one above: a number a line for
-    each image in order, or for each frame number in the images' names; or lines of `seconds name`. Else EXIF.
-    An image that cannot be read gets a time between its neighbours'. Raises InputError for a list that matches the
-    images in none of these ways.
+    each image in order, or for each frame number in the images' names; or lines of `seconds name` or `name seconds`.
+    Else EXIF. An image that cannot be read gets a time between its neighbours'. Raises InputError for a list that
+    matches the images in none of these ways.
     """
     if not images:
         return None
@@ -97,11 +98,13 @@ def _from_list(path: Path, images: list[Path]) -> NDArray[np.float64]:
     rows = read_rows(path)
     try:
         if rows and all(len(row) >= 2 for row in rows):
-            by_name = {Path(row[1]).name: float(row[0]) for row in rows}
+            time, name = (0, 1) if _is_number(rows[0][0]) else (1, 0)
+            by_name = {Path(row[name]).name: float(row[time]) for row in rows}
             return np.array([by_name[p.name] for p in images], dtype=np.float64)
         times = np.array([float(row[0]) for row in rows], dtype=np.float64)
     except (KeyError, ValueError) as error:
-        raise InputError(f"{path}: no time for {error}: give one line of `seconds name` for each image") from error
+        reason = f"no time for {error}" if isinstance(error, KeyError) else f"a line states no seconds ({error})"
+        raise InputError(f"{path}: {reason}: give one line of `seconds name` for each image") from error
     if len(times) == len(images):
         return times
     numbers = [frame_number(p) for p in images]
@@ -111,6 +114,13 @@ def _from_list(path: Path, images: list[Path]) -> NDArray[np.float64]:
         f"{path} has {len(times)} times for {len(images)} images, and their names hold no row numbers: "
         "give one line for each image, or remove the file"
     )
+
+
+def _is_number(text: str) -> bool:
+    with suppress(ValueError):
+        float(text)
+        return True
+    return False
 
 
 def _require_increasing(times: NDArray[np.float64], path: Path) -> NDArray[np.float64]:

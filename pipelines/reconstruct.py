@@ -116,6 +116,8 @@ def reconstruct(
     Raises InputError for a source that cannot be used and for a folder that holds something else; a folder made by
     this call is removed again when the source turns out to be unusable.
     """
+    if (made := RunFolder(source)).manifest_file.is_file() and made.settings_file.is_file():
+        raise InputError(f"{source} is a run, no source: go on with it by `msgs-slam resume {quoted(source)}`")
     require_unicode(source.resolve())  # the manifest names it
     require_unicode(run.root.absolute())
     config = _settled(config)

@@ -1,6 +1,7 @@
 """Which depth map, label image or pose row belongs to which colour image."""
 
 import itertools
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -53,10 +54,15 @@ def files_for_images(images: list[Path], folder: Path, pattern: str = "*") -> tu
         return ()
     files = sorted((p for p in folder.glob(pattern) if p.suffix.lower() in IMAGE_SUFFIXES), key=_by_name)
     files = [p for p in files if not p.name.startswith(".")]
-    by_stem = {_bare_name(p): p for p in files}
-    by_number = {frame_number(p): p for p in reversed(files)}
-    by_number.pop(None, None)
-    found = tuple(by_stem.get(_bare_name(image)) or by_number.get(frame_number(image)) for image in images)
+    # A name before its dots, and a number, say which image only where no other image has it: of 17.25.png and 17.50.png
+    # both are 17.
+    rules: tuple[Callable[[Path], object], ...] = (lambda p: p.stem, _bare_name, frame_number)
+    found: tuple[Path | None, ...] = (None,) * len(images)
+    for rule in rules:
+        keys, file_of = [rule(image) for image in images], {rule(p): p for p in reversed(files)}
+        times = Counter(keys)
+        usable = [k is not None and times[k] == 1 for k in keys]
+        found = tuple(f or (file_of.get(k) if ok else None) for f, k, ok in zip(found, keys, usable, strict=True))
     if files and not any(found):
         raise InputError(
             f"none of the {len(files)} files in {folder} belongs to an image of {images[0].parent}: "

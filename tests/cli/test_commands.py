@@ -279,6 +279,13 @@ def test_options_that_would_do_nothing_or_something_else_are_refused(words: tupl
     assert reason in " ".join(result.stderr.split())
 
 
+def test_a_run_is_no_source(tmp_path: Path) -> None:
+    run = run_of(tmp_path / "room.msgs")
+    refused = invoke("reconstruct", run.root)
+    assert refused.exit_code == 1
+    assert f"is a run, no source: go on with it by `msgs-slam resume {run.root}`" in refused.stderr
+
+
 def test_a_class_map_that_is_none_is_refused_before_the_run_is_looked_at(tmp_path: Path) -> None:
     result = invoke("evaluate", tmp_path / "no.msgs", "--truth", tmp_path, "--class-map", "mine.toml")
     assert result.exit_code == 1

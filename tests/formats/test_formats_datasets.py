@@ -235,6 +235,17 @@ def test_classes_of_a_generic_folder(tmp_path: Path) -> None:
             open_sequence(tmp_path)
 
 
+def test_images_named_by_their_times_have_each_its_own_depth(tmp_path: Path) -> None:
+    """What stands before the first dot is the same for all images of a second."""
+    names = ["17.25", "17.50", "17.75", "18.00"]
+    _write_images(tmp_path / "rgb", [f"{n}.jpg" for n in names])
+    _write_depth(tmp_path / "depth", [f"{n}.png" for n in names])
+    assert [p.stem for p in open_sequence(tmp_path, "folder").depth_paths if p] == names
+    (tmp_path / "depth" / "17.50.png").unlink()
+    found = open_sequence(tmp_path, "folder").depth_paths
+    assert [p and p.stem for p in found] == ["17.25", None, "17.75", "18.00"]
+
+
 def test_depth_that_belongs_to_no_image_is_refused(tmp_path: Path) -> None:
     _write_images(tmp_path / "rgb", ["a.png", "b.png"])
     _write_depth(tmp_path / "depth", ["c.png", "d.png"])

@@ -367,12 +367,18 @@ def test_times_by_order_by_number_and_by_name(tmp_path: Path) -> None:
     assert read_image_times(images) == pytest.approx([1.5, 2.5, 4])
     (tmp_path / "rgb" / "timestamps.txt").write_text("# time name\n5 rgb/000003.png\n4 rgb/000000.png\n6 000006.png")
     assert read_image_times(images) == pytest.approx([4, 5, 6])
+    # As the stage `frames` of a run writes them.
+    (tmp_path / "rgb" / "timestamps.txt").write_text("000003.png 5\n000000.png 4\n000006.png 6\n")
+    assert read_image_times(images) == pytest.approx([4, 5, 6])
 
 
 def test_times_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     images = _touch_images(tmp_path, ["a.png", "b.png"])
     assert read_image_times(images) is None
-    for text, message in [("1\n2\n3\n", "3 times for 2"), ("2\n1\n", "increase"), ("1 a.png\n2 c.png", "no time")]:
+    for text, message in [
+        ("1\n2\n3\n", "3 times for 2"), ("2\n1\n", "increase"), ("1 a.png\n2 c.png", "no time for 'b.png'"),
+        ("1 a.png\ntwo b.png", "states no seconds"),
+    ]:  # fmt: skip
         (tmp_path / "timestamps.txt").write_text(text)
         with pytest.raises(InputError, match=message):
             read_image_times(images)
