@@ -1,6 +1,7 @@
 """Depth from a folder of files, ground truth or the user's own model's, and which file of a folder is which frame's."""
 
 import re
+from collections import Counter
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -208,20 +209,24 @@ def as_read(array: NDArray, turn: int, frame: Intrinsics) -> NDArray:
 def match_files(
     folder: Path, suffixes: tuple[str, ...], names: tuple[str, ...], frames: list[Frame], is_video: bool
 ) -> dict[int, Path]:
-    """Frame id → file. An image folder matches by name, then by the last number in it; a video by source index.
+    """Frame id → file. An image folder matches by name, then by the last number in it where no other image or file has
+    that; a video by source index.
 
     Raises InputError when no frame finds a file.
     """
     files = _list(folder, suffixes, names)
     by_key = {frame_key(p.name): p for p in files}
-    by_number = {int(m.group(1)): p for p in files if (m := _LAST_NUMBER.search(p.stem))}
+    by_number = {n: p for p in reversed(files) if (n := _last_number(p.stem)) is not None}
+    # Two of a kitchen and a hall may be number 3: that of the one is none of the other's.
+    stems = {p.stem for p in files}, [Path(f.name).stem for f in frames]
+    usable = set.intersection(*({n for n, k in Counter(map(_last_number, s)).items() if k == 1} for s in stems))
     found = {}
     for frame in frames:
         if is_video:
             path = by_number.get(frame.source_index)
-        else:
-            number = _LAST_NUMBER.search(Path(frame.name).stem)
-            path = by_key.get(frame_key(frame.name)) or (by_number.get(int(number.group(1))) if number else None)
+        elif (path := by_key.get(frame_key(frame.name))) is None:
+            number = _last_number(Path(frame.name).stem)
+            path = by_number.get(number) if number is not None and number in usable else None
         if path is not None:
             found[frame.id] = path
     if not found:
@@ -231,6 +236,11 @@ def match_files(
             f"({frames[0].name} …). Name each file by {rule}"
         )
     return found
+
+
+def _last_number(stem: str) -> int | None:
+    found = _LAST_NUMBER.search(stem)
+    return int(found.group(1)) if found else None
 
 
 def _list(folder: Path, suffixes: tuple[str, ...], names: tuple[str, ...]) -> list[Path]:

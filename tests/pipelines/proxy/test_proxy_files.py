@@ -12,7 +12,7 @@ from proxy_room import Room, write_source
 from msgs_slam.formats.datasets.sequence import find_class_table, read_class_table
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
-from msgs_slam.pipelines.depth.files import FilesDepth, frame_key
+from msgs_slam.pipelines.depth.files import FilesDepth, frame_key, match_files
 from msgs_slam.pipelines.labels.files import FilesLabels
 from msgs_slam.pipelines.providers import DepthEstimate, Sequence
 from msgs_slam.pipelines.proxy.inputs import _before_frames, check_proxy
@@ -151,6 +151,24 @@ def test_missing_folders_and_foreign_names_are_refused(source: Path, room: Room,
 )
 def test_names_of_one_instant_have_one_key(picture: str, other: str) -> None:
     assert frame_key(picture) == frame_key(other)
+
+
+@pytest.mark.parametrize(
+    ("images", "files", "expected"),
+    [
+        (["kitchen_3.jpg", "hall_3.jpg"], ["kitchen_3.png"], {0: "kitchen_3.png"}),
+        (["17.25.jpg", "18.25.jpg"], ["17.25.png", "19.25.png"], {0: "17.25.png"}),
+        (["frame4.jpg", "frame5.jpg"], ["map4.png", "map4.npy"], {0: "map4.npy"}),
+    ],
+)
+def test_a_number_that_several_have_says_nothing(
+    images: list[str], files: list[str], expected: dict[int, str], tmp_path: Path
+) -> None:
+    for name in files:
+        (tmp_path / name).write_bytes(b"")
+    frames = [Frame(i, name, float(i), i, 1.0) for i, name in enumerate(images)]
+    found = match_files(tmp_path, (".png", ".npy"), ("depth",), frames, False)
+    assert {i: path.name for i, path in found.items()} == expected
 
 
 def test_a_video_matches_files_by_the_number_of_its_frame(source: Path, room: Room, tmp_path: Path) -> None:
