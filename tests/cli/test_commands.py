@@ -269,6 +269,8 @@ def test_export_with_other_settings_must_say_where_to(tmp_path: Path) -> None:
     ("words", "reason"),
     [
         (("export", "--to", "x", "--set", "mapping.passes=3"), "msgs-slam resume no.msgs --set mapping.passes=3"),
+        (("export", "--to", ""), "the name is empty; the working folder is ."),
+        (("reconstruct", "--out", ""), "the name is empty; the working folder is ."),
         (("report", "--to", "report.pdf"), "report.html; with --pdf"),
         (("report", "--to", "report.PDF", "--pdf"), "report.html; with --pdf"),
     ],
