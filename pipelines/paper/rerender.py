@@ -171,14 +171,14 @@ class Rerendering:
         )  # fmt: skip
 
     def cost(self) -> float:
-        """Mean over the pixels drawn of log(1 + r²) of photo and of depth residuals."""
+        """Mean over the pixels drawn of log(1 + r²) of photo and of depth residuals; infinite where none is drawn."""
         total, count = 0.0, 0
         for i, j in self.pairs:
             seen = self.drawn(i, j)
             photo, deep = np.log1p((seen.terms * seen.photo**2).sum(1)), np.log1p(seen.deep**2)
             total += float((self.samples[i].weight[seen.rows] * (photo + self.constants.map_depth * deep)).sum())
             count += len(seen.rows)
-        return total / max(count, 1)
+        return total / count if count else np.inf
 
     def equations(self, i: int, j: int) -> tuple[Array, NDArray[np.int64], Array]:
         """Rows (3 n, 20) of the weighted Jacobian, the unknowns (3 n, 20) that they are of, and residuals (3 n,).
@@ -248,7 +248,7 @@ class Rerendering:
             tried = ((there := best.stepped(d), there.cost()) for d in _DAMPINGS)
             there, found = next((t for t in tried if t[1] < cost), (best, cost))
             gain, best, cost = cost - found, there, found
-            if gain < 0.002 * cost:
+            if not gain >= 0.002 * cost:  # no number where nothing was drawn
                 break
         return best
 

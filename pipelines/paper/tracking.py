@@ -108,7 +108,8 @@ class _Problem:
             problem = problem.minimised(self.weights.track_iterations // 2)
             poses = problem.poses
         share = len(problem.drawn(0, 1).rows) / max(len(drawn.depth), 1)
-        return torch.from_numpy(poses[1]), share * problem.cost() + (1 - share) * _MISSED
+        cost = share * problem.cost() + (1 - share) * _MISSED if share else _MISSED
+        return torch.from_numpy(poses[1]), cost
 
     def _as_view(self, shown: Rendering, inside: Tensor) -> View:
         """What the map shows, as if it had been seen there."""

@@ -508,6 +508,17 @@ def test_25_rows_are_the_slopes_of_the_residuals(i: int, j: int) -> None:
         assert two.shape[0] == moved.shape[0]
 
 
+def test_25_a_step_after_which_nothing_is_drawn_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = [rerender.sample(a_view(i, 0.1 * i), 2) for i in range(2)]
+    start, fields, second = np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, FINE.size)), np.array([False, True])
+    problem = rerender.Rerendering(samples, start, fields, second, second, [(0, 1)], 2.0, start)
+    away = start + np.array([[[0.0]], [[100.0]]]) * np.eye(4, k=3)
+    monkeypatch.setattr(rerender.Rerendering, "stepped", lambda self, damping: replace(self, poses=away))
+    assert len(replace(problem, poses=away).drawn(0, 1).rows) == 0
+    assert (problem.minimised(3).poses == start).all()
+    assert np.isfinite(replace(problem, poses=away).minimised(3).poses).all()
+
+
 def test_gaussians_go_with_their_keyframe_and_its_field() -> None:
     view = a_view()
     gaussians = a_map(view)
