@@ -86,6 +86,10 @@ class FriendlyGroup(click.Group):
             if "with an exception set" not in str(error):  # so numba says where Ctrl-C met a kernel
                 raise
             raise Interrupted("stopped by Ctrl-C") from error
+        except RuntimeError as error:
+            if not str(error).startswith("Symlink loop"):  # so pathlib says it
+                raise
+            raise click.ClickException(printable(f"{error}: a link that leads to itself. Remove it")) from error
         except OSError as error:
             if error.errno not in _SYSTEM_REFUSES:
                 raise

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from cli_runs import FinishedRun
 from click.testing import CliRunner, Result
+from PIL import Image
 
 from msgs_slam.formats.atomic import temporary_of
 from msgs_slam.formats.video_writer import write_video
@@ -279,6 +280,17 @@ def test_options_that_would_do_nothing_or_something_else_are_refused(words: tupl
     result = invoke(words[0], "no.msgs", *words[1:])
     assert result.exit_code == 2
     assert reason in " ".join(result.stderr.split())
+
+
+@pytest.mark.parametrize("words", [("reconstruct", "loop"), ("resume", "loop"), ("reconstruct", ".", "--out", "loop")])
+def test_a_link_that_leads_to_itself(words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("loop").symlink_to("loop")
+    for name in "ab":
+        Image.new("RGB", (8, 8)).save(f"{name}.png")
+    refused = invoke(*words)
+    assert refused.exit_code == 1
+    assert "loop" in refused.stderr
 
 
 def test_a_run_is_no_source(tmp_path: Path) -> None:
