@@ -22,7 +22,7 @@ from .read_config import with_absolute_paths
 from .run.folder import RunFolder, load_records, load_settings, load_source
 from .run.lock import LEADER, LOCK, ProgressFile, RunBusyError, locked, make_folder
 from .run.manifest import StageRecord, recorded_config
-from .source.opening import source_digest
+from .source.opening import require_different, source_digest
 from .system.device import require_device
 from .system.memory import available_cpus
 from .system.progress import Progress, log, stop_if_asked
@@ -69,6 +69,7 @@ def one_source(sources: Sequence[Path], run: RunFolder) -> Path:
     """
     if len(sources) == 1:
         return sources[0]
+    require_different(sources)
     require_listable([*sources, run.root])
     _require_run_or_empty(run)
     path, text = run.root / SOURCE_LIST, "".join(f"{source.resolve()}\n" for source in sources)

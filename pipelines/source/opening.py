@@ -1,7 +1,8 @@
 """The kinds of source, a video file, a folder of images or a data set, read alike."""
 
 import re
-from collections.abc import Container, Iterator
+from collections import Counter
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -174,6 +175,13 @@ def source_digest(source: Path, format: str) -> str:
         return file_sha256(source) if files == (source,) else files_sha256((str(i), f) for i, f in enumerate(files))
     images, times = list_images(source), times_file(source)
     return files_sha256(sorted((p.name, p) for p in [*images, *([times] if times else [])]))
+
+
+def require_different(videos: Iterable[Path]) -> None:
+    """Raise InputError for a video that is named twice: each of its frames would have a twin that does not move."""
+    counts = Counter(video.resolve() for video in videos)
+    if twice := next((video for video, times in counts.items() if times > 1), None):
+        raise InputError(f"{twice} is given {counts[twice]} times: give each video once")
 
 
 def is_of_source(path: Path, run: RunFolder) -> bool:

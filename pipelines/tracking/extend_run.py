@@ -20,7 +20,7 @@ from ..run.folder import RunFolder, load_records, load_source
 from ..run.manifest import Manifest, Source, write_manifest
 from ..sfm.lens import Lens, calibrated_camera, make_lens, to_pycolmap
 from ..source.given import read_intrinsics
-from ..source.opening import VideoSource, open_source, source_digest, video_files
+from ..source.opening import VideoSource, open_source, require_different, source_digest, video_files
 from ..source.recording import RecordingSource
 from ..source.sharpness import reduce_image
 from ..system.progress import Progress
@@ -63,6 +63,7 @@ def require_extendable(run: RunFolder, videos: Sequence[Path], config: Config, p
             f"{run.root} was made with --method paper, which poses frames in their order and grows no finished map: "
             "reconstruct all the videos together, in a new run"
         )
+    require_different(videos)
     require_listable(videos)
     width, height = _size(video_files(source)[0])
     for video in videos:
