@@ -46,6 +46,8 @@ def write_colmap(outcome: Outcome, folder: Path) -> list[Path]:
         copy_file(outcome.run.image_file(frame), folder / IMAGES / frame.name)
         if (left_out := outcome.run.left_out(frame)) is not None:
             LEFT_OUT.save(folder, left_out, frame.name)
+        else:  # of an earlier export, before the frame was made without one
+            LEFT_OUT.path(folder, frame.name).unlink(missing_ok=True)
     points = seen_points(outcome.load_sparse(), trajectory.frame_ids[posed])
     pinhole = ("PINHOLE", k.width, k.height, (k.fx, k.fy, k.cx, k.cy))
     model = ColmapModel(names, trajectory.cam_from_world[posed], (pinhole,), *points)

@@ -22,7 +22,7 @@ from msgs_slam.pipelines.export.readme import licences
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.run.files import FRAMES, PROXY_MAPS
+from msgs_slam.pipelines.run.files import FRAMES, LEFT_OUT, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import WORLD
 from msgs_slam.pipelines.types import Metres
@@ -151,6 +151,15 @@ def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
         notes = (tmp_path / only / "README.txt").read_text()
         assert expected[only] in notes
         assert "mesh.ply" not in notes
+
+
+def test_a_mask_of_an_earlier_export_does_not_stay(run: RunFolder, tmp_path: Path) -> None:
+    """Trainers read masks/ beside images/: one that the run has no longer would leave out what is there."""
+    export_run(run, tmp_path, "colmap")
+    frame = run.load(FRAMES)[0]
+    LEFT_OUT.save(tmp_path, np.ones((4, 4), bool), frame.name)
+    export_run(run, tmp_path, "colmap")
+    assert not LEFT_OUT.path(tmp_path, frame.name).exists()
 
 
 def test_licences_of_the_networks_are_in_the_notes() -> None:
