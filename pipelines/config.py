@@ -384,6 +384,13 @@ def with_method(config: Config) -> Config:
     return replace(config, proxy=replace(config.proxy, **PAPERS_PROXY)) if config.run.method == "paper" else config
 
 
+def without_method(config: Config) -> Config:
+    """Undo `with_method` in settings that are to be those of another method: what it gave is nobody's choice."""
+    usual = ProxyConfig()
+    given = {k: getattr(usual, k) for k, value in PAPERS_PROXY.items() if getattr(config.proxy, k) == value}
+    return replace(config, proxy=replace(config.proxy, **given))
+
+
 def overridden(config: Config) -> list[str]:
     """Settings that were chosen and that `with_method` gives another value, as name=value."""
     chosen = {k: getattr(config.proxy, k) for k in PAPERS_PROXY if config.run.method == "paper"}

@@ -9,7 +9,7 @@ from ..formats.atomic import temporary_of, unique_temp_names, write_text
 from ..formats.errors import InputError, RecoverableError
 from ..formats.reading import require_listable, require_unicode
 from ..formats.video import probe_video
-from .config import SOURCE_LIST, STAGES, Config, overridden, with_method
+from .config import SOURCE_LIST, STAGES, Config, overridden, with_method, without_method
 from .engine.runner import run_stages
 from .engine.stages import Later, Stage, TaskWorkers
 from .engine.tasks import BETWEEN_LOOKS, Shard, SharedWorkers, boards_in
@@ -121,7 +121,7 @@ def reconstruct(
         raise InputError(f"{source} is a run, no source: go on with it by `msgs-slam resume {quoted(source)}`")
     require_unicode(source.resolve())  # the manifest names it
     require_unicode(run.root.absolute())
-    config = _settled(config)
+    config = _settled(config, run)
     digest = source_digest(source, config.run.format)
     _require_run_or_empty(run)
     require_device(config.run.device)  # refused before anything is written
@@ -130,8 +130,11 @@ def reconstruct(
         return _run(run, source.resolve(), digest, config, progress, until, workers, threads)
 
 
-def _settled(config: Config) -> Config:
+def _settled(config: Config, run: RunFolder) -> Config:
     """The settings as the method needs them; a chosen one that it does not use is warned of."""
+    was = existing_config(run)
+    if was is not None and was.run.method == "paper" != config.run.method:
+        config = without_method(config)
     if lost := overridden(config):
         log.warning(
             f"--method paper gives every frame its own proxies as they are: {', '.join(lost)} is not used. Leave it "
@@ -157,7 +160,7 @@ def resume(
         )
     origin = load_source(run)
     source = Path(origin.path)
-    config = _settled(config or load_settings(run))
+    config = _settled(config or load_settings(run), run)
     require_device(config.run.device)
     with locked(run):
         on_locked()
