@@ -166,7 +166,8 @@ def _measure(
     found: dict[str, list[ViewFigures]] = {"keyframe": [], "held_out": []}
     keys = set(trajectory.frame_ids[trajectory.is_keyframe].tolist())
     nothing = np.zeros(3, np.float32)
-    for i, pose in zip(trajectory.frame_ids.tolist(), trajectory.cam_from_world, strict=True):
+    posed = trajectory.is_posed
+    for i, pose in zip(trajectory.frame_ids[posed].tolist(), trajectory.cam_from_world[posed], strict=True):
         if i in keys:
             view = recording.scaled(i, fields)
             found["keyframe"].append(measure_view(gaussian_map, view, pose, nothing, nothing))

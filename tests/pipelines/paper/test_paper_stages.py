@@ -153,6 +153,22 @@ def test_a_loop_that_is_measured_moves_everything(whole: RunFolder) -> None:
     assert not np.allclose(moved_map.means, gaussian_map.means)
 
 
+def test_a_frame_without_a_pose_measures_nothing(whole: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its pose is the identity, from which the map looks like anything but the frame."""
+    recording = stages.Recording(StageContext(whole, whole.root, CONFIG, whole.stage("tracking"), SilentProgress()))
+    trajectory, fields = whole.load(TRAJECTORY, "tracking"), whole.load(DEPTH_FIELDS, "tracking")
+    recording.held = {1, 2}
+    place = np.arange(len(trajectory.frame_ids))
+    reasons = tuple("lost" if i == 2 else "" for i in place.tolist())
+    some = replace(trajectory, is_keyframe=trajectory.is_keyframe & ~np.isin(place, [1, 2]), lost_reasons=reasons)
+    measured: list[int] = []
+    monkeypatch.setattr(stages, "measure_view", lambda gaussian_map, view, *rest: measured.append(view.frame_id))
+    monkeypatch.setattr(stages, "mean_figures", lambda found, name: {})
+    stages._measure(recording, whole.load(MAP, "tracking"), some, fields)
+    assert {0, 1} < set(measured)
+    assert 2 not in measured
+
+
 def test_the_switch_changes_three_stages_and_what_proxies_are() -> None:
     default, chosen = all_stages(), all_stages("paper")
     assert [s.name for s in default] == [s.name for s in chosen]
