@@ -55,7 +55,11 @@ def _override(text: str) -> tuple[dict[str, dict[str, Any]], str]:
     section, dot, name = key.strip().partition(".")
     if not separator or not dot:
         raise SettingError(f"--set {text}: expected section.key=value, for example --set frames.rate=5")
-    return {section: {name: _parse_value(value.strip())}}, f"--set {text}"
+    parsed, wanted = _parse_value(value.strip()), get_type_hints(type(getattr(Config(), section, None))).get(name)
+    # A folder may be called 2024_01 or 2024-01-31.
+    return {
+        section: {name: value.strip() if wanted is str and not isinstance(parsed, str) else parsed}
+    }, f"--set {text}"
 
 
 def merge_with_quality(config: Config, changes: Mapping[str, Any], source: str) -> Config:
