@@ -56,10 +56,9 @@ def _override(text: str) -> tuple[dict[str, dict[str, Any]], str]:
     if not separator or not dot:
         raise SettingError(f"--set {text}: expected section.key=value, for example --set frames.rate=5")
     parsed, wanted = _parse_value(value.strip()), get_type_hints(type(getattr(Config(), section, None))).get(name)
-    # A folder may be called 2024_01 or 2024-01-31.
-    return {
-        section: {name: value.strip() if wanted is str and not isinstance(parsed, str) else parsed}
-    }, f"--set {text}"
+    if wanted is str and not isinstance(parsed, str):
+        parsed = value.strip()  # a folder may be called 2024_01 or 2024-01-31
+    return {section: {name: parsed}}, f"--set {text}"
 
 
 def merge_with_quality(config: Config, changes: Mapping[str, Any], source: str) -> Config:

@@ -75,6 +75,12 @@ def test_paths_of_files_that_are_there_become_absolute(tmp_path: Path, monkeypat
     assert with_absolute_paths(load_config(overrides=["proxy.depth=multiview"])).proxy.depth == "multiview"
 
 
+@pytest.mark.parametrize("name", ["2024_01", "2024-01-31", "1.50", "1e3", "true", "10:30:00"])
+def test_a_text_that_toml_takes_for_something_else_is_a_text(name: str) -> None:
+    assert load_config(overrides=[f"frames.masks={name}"]).frames.masks == name
+    assert load_config(overrides=[f"frames.masks='{name}'"]).frames.masks == name
+
+
 def test_override_beats_file_beats_default(tmp_path: Path) -> None:
     file = tmp_path / "settings.toml"
     file.write_text("[frames]\nrate = 3\nmax_side = 320\n")
