@@ -1,18 +1,23 @@
-"""Depth in made rooms that nobody tuned on: forty to choose on, forty to judge on, and any number to learn from.
+"""Made rooms that nobody tuned on, for depth and for whole runs: forty to choose on, forty to judge on, and any number
+to learn from.
 
     python -m tests.benchmarks.rooms make DIR --set judge                   rooms of a set and the stereo's first pass
     python -m tests.benchmarks.rooms measure DIR NAME --set judge           the product's depth of them, kept as NAME
     python -m tests.benchmarks.rooms table DIR OLD [NEW] --set judge        one against the other
+    python -m tests.benchmarks.rooms video DIR --set judge --rooms 4        videos with their truth, DIR/video/SEED
     python -m tests.benchmarks.rooms learn DIR                              a learned choice, from the set `learn`
     python -m tests.benchmarks.rooms measure DIR NAME --choice              the depth that it chooses
 
 A default about depth is chosen on `choose` and reported on `judge`. A room is a seed: walls, textures, light, furniture
 (of Debian's `sweethome3d-furniture`, downloaded by apt-get or given by --package; none of it is in the repository), a
 walk of 12 keyframes, a camera; 15 CPU seconds each. Needs `pip install embreex`. Poses are those of the walk up to a
-millimetre. "off": wrong by more than 5 %; "unsure": confidence below 0.3 in OLD.
+millimetre. "off": wrong by more than 5 %; "unsure": confidence below 0.3 in OLD. `video` takes the kinds of rooms in
+turn; each is a walk of twelve seconds at 640x480 (40 CPU seconds), for `reconstruct DIR/video/SEED/video.mp4` and
+`evaluate --truth DIR/video/SEED --class-map tests/benchmarks/rooms/classes.toml`.
 """
 
 import argparse
+import itertools
 import os
 import time
 from pathlib import Path
@@ -29,6 +34,8 @@ from .choice.completion import Completion
 from .choice.model import load_model
 from .clip import Clip, make_clip
 from .furniture import furniture
+from .room import KINDS, kind_of
+from .video import make_video
 
 SETS = {"choose": (1000, 40), "judge": (2000, 40), "learn": (10_000, 300)}
 """First seed and number of rooms; seeds without a place to walk are passed over."""
@@ -57,6 +64,20 @@ def seeds_of(folder: Path, name: str, make: bool = False, package: Path | None =
         if path.exists():
             found.append(seed)
     return found
+
+
+def make_videos(folder: Path, name: str, package: Path | None, most: int) -> None:
+    """Leave videos of rooms of a set: the first home, office, classroom and bare room, then the second of each."""
+    first, count = SETS[name]
+    seeds = {kind: (s for s in range(first, first + 2 * count) if kind_of(s) == kind) for kind in KINDS}
+    for kind in itertools.islice(itertools.cycle(seeds), most or len(seeds)):
+        for seed in seeds[kind]:
+            start, target = time.process_time(), folder / "video" / str(seed)
+            if target.exists():
+                break
+            if make_video(seed, furniture(str(folder), str(package or "")), target):
+                print(f"{seed} {kind}: {time.process_time() - start:.1f} CPU seconds", flush=True)
+                break
 
 
 def learn_choice(folder: Path, most: int) -> None:
@@ -144,7 +165,7 @@ def _print(title: str, rows: list[dict[str, NDArray]], summary: object) -> None:
 def main() -> None:
     """Parse, do."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("make", "measure", "table", "learn"))
+    parser.add_argument("what", choices=("make", "measure", "table", "video", "learn"))
     parser.add_argument("folder", type=Path, metavar="DIR")
     parser.add_argument("names", nargs="*", metavar="NAME")
     parser.add_argument("--set", choices=SETS, default="choose")
@@ -153,6 +174,8 @@ def main() -> None:
     parser.add_argument("--package", type=Path, help="the .deb file of the furniture")
     given = parser.parse_args()
     cv2.setNumThreads(1)
+    if given.what == "video":
+        return make_videos(given.folder, given.set, given.package, given.rooms)
     seeds = seeds_of(given.folder, given.set, given.what == "make", given.package, given.rooms)
     if given.what == "measure":
         measure(given.folder, seeds, *given.names, choice=given.choice)

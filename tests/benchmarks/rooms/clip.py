@@ -211,7 +211,7 @@ def _exposed(light: list[NDArray[np.float32]], r: Random) -> list[NDArray[np.uin
     """Linear light as a camera stores it: exposure that drifts, white balance, vignetting, blur, noise, JPEG."""
     exposure = r.uniform(0.18, 0.42) / max(float(np.median(np.stack(light))), 1e-4)
     balance, drift = 1 + r.normal(size=3) * 0.04, np.cumsum(r.normal(size=len(light)) * r.choice([0, 0.01, 0.04]))
-    develop = _lens(light[0].shape[:2], r)
+    develop = lens(light[0].shape[:2], r)
     blur, grain, quality = abs(r.normal()) * 0.4, abs(r.normal()) * 0.8, int(r.integers(88, 100))
     shaken = r.random() < 0.3
     out = []
@@ -226,7 +226,7 @@ def _exposed(light: list[NDArray[np.float32]], r: Random) -> list[NDArray[np.uin
     return out
 
 
-def _lens(size: tuple[int, ...], r: Random) -> Callable[[NDArray], NDArray]:
+def lens(size: tuple[int, ...], r: Random) -> Callable[[NDArray], NDArray]:
     """Vignetting, a soft shoulder for what is bright, and the curve of sRGB."""
     height, width = size
     y, x = np.mgrid[:height, :width]

@@ -94,23 +94,29 @@ class LitRoom:
         self, world_from_cam: NDArray, width: int, height: int, focal: float, rays: int = 3
     ) -> tuple[Array, Array, NDArray[np.uint8]]:
         """(h, w, 3) linear light, (h, w) depth (0: nothing) and (h, w) class (255: nothing) from a pose (x right, y
-        down, z forward)."""
-        v, u = np.mgrid[0:height, 0:width] + 0.5
-        x = [(u + a - width / 2) / focal for a, _ in _SUB[:rays]]
-        y = [(v + b - height / 2) / focal for _, b in _SUB[:rays]]
-        ways = np.stack([np.stack([a, b, np.ones_like(a)], -1).reshape(-1, 3) for a, b in zip(x, y, strict=True)])
-        ways = ways.reshape(-1, 3)
-        length = np.linalg.norm(ways, axis=1)
-        turned = np.ascontiguousarray((ways / length[:, None]) @ world_from_cam[:3, :3].T, np.float32)
-        origins = np.broadcast_to(world_from_cam[:3, 3].astype(np.float32), turned.shape)
-        hit = self.cast(origins, turned)
-        color = self._color(hit, turned, focal)
-        self._add_mirrored(color, hit, origins, turned, focal)
-        first, one = width * height, hit["primID"][: width * height]
+        down, z forward), or from one of each ray and row (rays, h, 4, 4)."""
+        ways, origins, length = _rays(world_from_cam, width, height, focal, rays)
+        hit = self.cast(origins, ways)
+        color = self._color(hit, ways, focal)
+        self._add_mirrored(color, hit, origins, ways, focal)
+        mean = color.reshape(rays, height, width, 3).mean(0)
+        return mean, *self._first_hit(hit, length, (height, width))
+
+    def measure(
+        self, world_from_cam: NDArray, width: int, height: int, focal: float
+    ) -> tuple[Array, NDArray[np.uint8]]:
+        """Depth and class alone of `photograph`."""
+        ways, origins, length = _rays(world_from_cam, width, height, focal, 1)
+        return self._first_hit(self.cast(origins, ways), length, (height, width))
+
+    def _first_hit(
+        self, hit: dict[str, Any], length: NDArray, size: tuple[int, int]
+    ) -> tuple[Array, NDArray[np.uint8]]:
+        first = size[0] * size[1]
+        one = hit["primID"][:first]
         depth = np.where(one >= 0, hit["tfar"][:first] / length[:first], 0).astype(np.float32)
         seen = np.where(one >= 0, self.label[np.maximum(one, 0)], 255).astype(np.uint8)
-        mean = color.reshape(rays, height, width, 3).mean(0)
-        return mean, depth.reshape(height, width), seen.reshape(height, width)
+        return depth.reshape(size), seen.reshape(size)
 
     def _color(self, hit: dict[str, Any], ways: Array, focal: float) -> Array:
         out = np.zeros((len(ways), 3), np.float32)
@@ -196,6 +202,19 @@ class LitRoom:
             free = self.scene.run(origins, ways, until, query="OCCLUDED") != 0
             value[good] = (here * there / np.maximum(squared, 0.02))[good] * free
         return (value.mean(1) * area / np.pi)[:, None] * radiance.astype(np.float32)
+
+
+def _rays(world_from_cam: NDArray, width: int, height: int, focal: float, rays: int) -> tuple[Array, Array, NDArray]:
+    """Of each ray of each pixel (rays * h * w): direction, origin, and length of what has depth 1."""
+    v, u = np.mgrid[0:height, 0:width] + 0.5
+    x = [(u + a - width / 2) / focal for a, _ in _SUB[:rays]]
+    y = [(v + b - height / 2) / focal for _, b in _SUB[:rays]]
+    ways = np.stack([np.stack([a, b, np.ones_like(a)], -1) for a, b in zip(x, y, strict=True)])
+    length = np.linalg.norm(ways, axis=-1, keepdims=True)
+    poses = np.broadcast_to(world_from_cam, (rays, height, 4, 4))
+    turned = (ways / length) @ poses[..., :3, :3].swapaxes(-1, -2)
+    origins = np.broadcast_to(poses[:, :, None, :3, 3], ways.shape).astype(np.float32)
+    return np.ascontiguousarray(turned, np.float32).reshape(-1, 3), origins.reshape(-1, 3), length.reshape(-1)
 
 
 class _Places:

@@ -36,7 +36,7 @@ class Room:
 def build_room(seed: int, catalogue: Catalogue) -> tuple[Room, Random]:
     """The room of a seed, and the source of chance for what follows."""
     r = np.random.default_rng(seed)
-    kind = str(r.choice(list(KINDS), p=list(KINDS.values())))
+    kind = _kind(r)
     size = r.uniform(3, 6.5), r.uniform(3.2, 7.5), r.uniform(2.3, 3.2)
     if kind == "class":
         size = r.uniform(5.5, 9), r.uniform(6, 10), r.uniform(2.7, 3.6)
@@ -45,6 +45,15 @@ def build_room(seed: int, catalogue: Catalogue) -> tuple[Room, Random]:
     _hang_lights(room, r)
     _Furnisher(room, r).furnish()
     return room, r
+
+
+def kind_of(seed: int) -> str:
+    """The kind of the room of a seed, without building it."""
+    return _kind(np.random.default_rng(seed))
+
+
+def _kind(r: Random) -> str:
+    return str(r.choice(list(KINDS), p=list(KINDS.values())))
 
 
 def surface(s: Surfaces, r: Random, kind: str) -> int:

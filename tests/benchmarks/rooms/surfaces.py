@@ -203,7 +203,9 @@ def _close(s: Surfaces, wall: Wall, hole: Opening, material: int, trim: Trim, r:
 
 def _glaze(s: Surfaces, frame: Array, corner: Array, a: Array, b: Array, trim: Trim, r: Random) -> None:
     width, height = float(np.linalg.norm(a)), float(np.linalg.norm(b))
-    s.quad(corner, a, b, trim.sky, [(0, 1), (1, 1), (1, 0), (0, 0)], light=trim.sky_light)
+    u, v = (corner[::2] * 0.37 % 1) * 0.4  # no two windows show the same
+    view = [(u, v + 0.6), (u + 0.6, v + 0.6), (u + 0.6, v), (u, v)]
+    s.quad(corner, a, b, trim.sky, view, light=trim.sky_light)
     t, columns, rows = r.uniform(0.03, 0.07), int(r.integers(1, 4)), int(r.integers(1, 3))
     for i in range(columns + 1):
         x = min(max(i * width / columns - t / 2, 0), width - t)
