@@ -24,6 +24,8 @@ TRUTH_EVERY = 6
 _CELL, _BODY, _CLEAR = 0.05, 0.25, 0.3
 """Metres: cells of the floor, room that a person takes around its middle, what the camera stays away from things."""
 _TRIES, _COMPARED = 4000, 12
+_FAR = 1.5
+"""Metres of a walk: on a shorter one the camera hardly does more than turn."""
 Array = NDArray[np.float64]
 
 
@@ -40,6 +42,13 @@ class Walk:
     frequencies: Array
     phases: Array
     amplitudes: Array
+
+    @property
+    def length(self) -> float:
+        """Metres of the curve, without tremor and sway."""
+        u = np.linspace(0, 1, 33)[:, None]
+        a, b, c = self.curve
+        return float(np.linalg.norm(np.diff((1 - u) ** 2 * a + 2 * u * (1 - u) * b + u**2 * c, axis=0), axis=1).sum())
 
     def poses(self, times: Array) -> Array:
         """world_from_cam (..., 4, 4) at `times` (...) in seconds; x right, y down, z forward."""
@@ -103,8 +112,8 @@ def _describe(folder: Path, poses: Array, times: Array, focal: float) -> None:
 
 
 def _walk(room: Room, lit: LitRoom, r: Random) -> Walk | None:
-    """A curve of 1.2 to 5 metres over free floor; of some such walks that which sees farthest: people film across a
-    room."""
+    """A curve of 1.2 to 5 metres over free floor; of some such walks that which sees farthest and is no mere
+    turn: people film across a room."""
     free, ball = _free_floor(room), r.normal(size=(150, 3))
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
     places = (np.argwhere(free) + 0.5) * _CELL
@@ -119,7 +128,7 @@ def _walk(room: Room, lit: LitRoom, r: Random) -> Walk | None:
         if not 1.2 <= length <= 5 or not free[tuple(np.clip(cells, 0, np.array(free.shape) - 1).T)].all():
             continue
         if (seen := _sees(lit, path[::4], ball)) > 0:
-            found.append((seen, walk))
+            found.append((seen * min(1.0, walk.length / _FAR), walk))
         if len(found) == _COMPARED:
             break
     return max(found, key=lambda f: f[0])[1] if found else None
@@ -136,10 +145,10 @@ def _free_floor(room: Room) -> NDArray[np.bool_]:
 
 
 def _some_walk(curve: Array, r: Random) -> Walk:
-    frequencies = np.concatenate([[r.uniform(1.6, 2.0)], r.uniform(0.3, 7, 11)])
+    frequencies = np.concatenate([[r.uniform(1.6, 2.0)], r.uniform(0.3, 3, 11)])
     size = np.array([0.004, 0.004, 0.004, 0.006, 0.005, 0.006]) * r.uniform(0.5, 1.5)
-    amplitudes = r.normal(size=(12, 6)) * size / np.sqrt(frequencies)[:, None]
-    amplitudes[0] = [0.006, 0.01, 0.006, 0.002, 0.004, 0.003]
+    amplitudes = r.normal(size=(12, 6)) * size / frequencies[:, None]
+    amplitudes[0] = [0.006, 0.01, 0.006, 0.001, 0.002, 0.001]
     sweep = math.radians(r.uniform(80, 230)) * r.choice([-1, 1])
     pitch, nod = r.normal() * 0.08 - 0.2, r.uniform(0.05, 0.2)
     return Walk(curve, r.uniform(0, 2 * np.pi), sweep, pitch, nod, frequencies, r.uniform(0, 6.28, 12), amplitudes)
