@@ -69,7 +69,7 @@ def seeds_of(folder: Path, name: str, make: bool = False, package: Path | None =
 def make_videos(folder: Path, name: str, package: Path | None, most: int) -> None:
     """Leave videos of rooms of a set: the first home, office, classroom and bare room, then the second of each."""
     first, count = SETS[name]
-    seeds = {kind: (s for s in range(first, first + 2 * count) if kind_of(s) == kind) for kind in KINDS}
+    seeds = {kind: iter([s for s in range(first, first + 2 * count) if kind_of(s) == kind]) for kind in KINDS}
     for kind in itertools.islice(itertools.cycle(seeds), most or len(seeds)):
         for seed in seeds[kind]:
             start, target = time.process_time(), folder / "video" / str(seed)
