@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..geometry.posed_depth import PosedDepth, neighbours
 from ..geometry.sparse_model import SparseModel
+from ..providers import DepthEstimate
 from ..system.memory import ALIGNED_TOGETHER
 from ..system.parallel import LruSequence
 from ..types import Intrinsics, ProxyMaps
@@ -24,17 +25,13 @@ from .fields import FINE, Basis, DepthFields, Equations, Grid, Prior, solve_fiel
 
 Array = NDArray[np.float64]
 
-VIEWS_PRIOR = Prior(FINE, node_sd=0.05, step_sd=0.08)
-"""Around what the keyframe's own points say."""
 SAMPLES_ACROSS = 40
 SIDE = 320
 """Pixels on the long side of the depths that are compared."""
-PAIR_SD, POINT_SD = 0.03, 0.01
-"""Expected disagreement of two views about a surface, and of a view with a triangulated point."""
+POINT_SD = 0.01
+"""Expected disagreement of a view with a triangulated point."""
 GROSS = 0.15
 """A larger disagreement is another surface."""
-SHARE = 0.25
-"""Neighbouring samples err alike: an image's worth of them counts as a few per node."""
 ROUNDS = 4
 _ROOM = 60_000_000
 """Bytes of depths, and of samples of them, that are kept; what has no room is read again."""
@@ -55,6 +52,20 @@ class WorldScale:
     factor: float
     relative_sd: float
     keyframes: int
+
+
+@dataclass(frozen=True)
+class FieldModel:
+    """The prior of a field around its expected value, the expected disagreement of two views about a surface, and what
+    part of an equation a sample is: neighbouring samples may err alike."""
+
+    prior: Prior
+    pair_sd: float
+    share: float
+
+
+OF_PROXIES = FieldModel(Prior(FINE, node_sd=0.05, step_sd=0.08), pair_sd=0.03, share=0.25)
+"""Around what the keyframe's own points say."""
 
 
 def sample_proxy(maps: ProxyMaps, xy: Array, intrinsics: Intrinsics) -> tuple[Array, Array]:
@@ -127,10 +138,16 @@ def as_fine(field: Array) -> Array:
 
 @dataclass(frozen=True)
 class Anchors:
-    """Triangulated points of one view: xy (P, 2) in its pixels, depth (P,)."""
+    """Points of one view whose depth is known: xy (P, 2) in its pixels, depth (P,) and its relative error sd (P,)."""
 
     xy: Array
     depth: Array
+    sd: Array
+
+    def and_also(self, others: Anchors) -> Anchors:
+        """Join two sets of points of the view."""
+        pairs = ((self.xy, others.xy), (self.depth, others.depth), (self.sd, others.sd))
+        return Anchors(*(np.concatenate(pair) for pair in pairs))
 
 
 def align_keyframes(
@@ -148,25 +165,31 @@ def align_keyframes(
     def view_of(row: int) -> PosedDepth:
         maps = load_maps(int(model.frame_ids[row]))
         assert maps is not None, "there was one before"
-        return _posed(maps, intrinsics, model.cam_from_world[row])
+        return posed_small(maps, intrinsics, model.cam_from_world[row])
 
     rows: list[int] = []
     anchors: dict[int, Anchors] = {}
     for k, frame_id in enumerate(model.frame_ids.tolist()):
         maps = load_maps(frame_id)
         if maps is not None and (maps.depth > 0).any():
-            camera = _posed(maps, intrinsics, model.cam_from_world[k]).intrinsics
-            anchors[len(rows)] = _anchors(model, k, intrinsics, camera)
+            camera = posed_small(maps, intrinsics, model.cam_from_world[k]).intrinsics
+            anchors[len(rows)] = seen_points(model, k, intrinsics, camera)
             rows.append(k)
     ids = [int(model.frame_ids[k]) for k in rows]
-    views = LruSequence(len(rows), lambda n: view_of(rows[n]), lambda v: v.depth.nbytes + v.trust.nbytes, _ROOM)
+    views = kept_views(len(rows), lambda n: view_of(rows[n]))
     middle = float(np.median([np.median(e) for e in expected.values()])) if expected else 0.0
     start = np.array([expected.get(i, np.full(FINE.size, middle)) for i in ids]).reshape(len(ids), FINE.size)
     fields = fit_fields(views, anchors, start)
     return DepthFields({i: f.reshape(FINE.rows, FINE.columns) for i, f in zip(ids, fields, strict=True)})
 
 
-def _posed(maps: ProxyMaps, intrinsics: Intrinsics, cam_from_world: Array) -> PosedDepth:
+def kept_views(count: int, make: Callable[[int], PosedDepth]) -> Sequence[PosedDepth]:
+    """Keep as many views as there is room for; make the others again when they are asked for."""
+    return LruSequence(count, make, lambda v: v.depth.nbytes + v.trust.nbytes, _ROOM)
+
+
+def posed_small(maps: ProxyMaps | DepthEstimate, intrinsics: Intrinsics, cam_from_world: Array) -> PosedDepth:
+    """Depths at the size that is compared."""
     stride = max(round(max(maps.depth.shape) / SIDE), 1)
     picked = (slice(stride // 2, None, stride),) * 2
     depth, trust = maps.depth[picked].copy(), maps.confidence[picked].copy()
@@ -174,32 +197,38 @@ def _posed(maps: ProxyMaps, intrinsics: Intrinsics, cam_from_world: Array) -> Po
     return PosedDepth(intrinsics.resized(width, height).every(stride), cam_from_world, depth, trust * (depth > 0))
 
 
-def _anchors(model: SparseModel, k: int, full: Intrinsics, small: Intrinsics) -> Anchors:
+def seen_points(model: SparseModel, k: int, full: Intrinsics, small: Intrinsics) -> Anchors:
     """The model's points in the pixels of the k-th keyframe that sees them."""
     mine = model.observations_of(k)
     points = model.points_in_world[model.obs_point[mine]]
     depth = points @ model.cam_from_world[k, 2, :3] + model.cam_from_world[k, 2, 3]
     (fx, fy, cx, cy), (small_fx, small_fy, small_cx, small_cy) = full.numbers, small.numbers
     rays = (model.obs_xy[mine] - [cx, cy]) / [fx, fy]
-    return Anchors(rays * [small_fx, small_fy] + [small_cx, small_cy], depth)
+    return Anchors(rays * [small_fx, small_fy] + [small_cx, small_cy], depth, np.full(len(depth), POINT_SD))
 
 
-def fit_fields(views: Sequence[PosedDepth], anchors: Mapping[int, Anchors], expected: Array | None = None) -> Array:
+def fit_fields(
+    views: Sequence[PosedDepth],
+    anchors: Mapping[int, Anchors],
+    expected: Array | None = None,
+    how: FieldModel = OF_PROXIES,
+) -> Array:
     """(N, nodes) log scales by robust least squares, re-linearised at every round; `anchors` by index of the view. Of a
     long recording a window of views at a time, the others unchanged."""
-    start = np.zeros((len(views), FINE.size)) if expected is None else expected
+    size = how.prior.grid.size
+    start = np.zeros((len(views), size)) if expected is None else expected
     fields = start.copy()
-    samples = LruSequence(len(views), lambda n: _Samples.of(views[n]), lambda s: s.nbytes, _ROOM)
+    samples = LruSequence(len(views), lambda n: _Samples.of(views[n], how.prior.grid), lambda s: s.nbytes, _ROOM)
     near = neighbours(views)
     windows = np.array_split(np.arange(len(views)), -(-len(views) // ALIGNED_TOGETHER)) if len(views) else []
     for window in windows * ROUNDS:
         first, last = int(window[0]), int(window[-1])
-        points = (_point_equations(n, views[n], anchors[n], fields) for n in window.tolist() if n in anchors)
+        points = (_point_equations(n, views[n], anchors[n], fields, how) for n in window.tolist() if n in anchors)
         touching = [(i, j) for i, j in near if first <= i <= last or first <= j <= last]
-        pairs = (_pair_equations(i, j, samples[i], views[j], fields) for i, j in touching)
-        own = range(first * FINE.size, (last + 1) * FINE.size)
+        pairs = (_pair_equations(i, j, samples[i], views[j], fields, how) for i, j in touching)
+        own = range(first * size, (last + 1) * size)
         parts = (equations.within(own) for equations in chain(points, pairs))
-        fields[window] = solve_fields(parts, fields[window], start[window], VIEWS_PRIOR)
+        fields[window] = solve_fields(parts, fields[window], start[window], how.prior)
     return fields
 
 
@@ -219,16 +248,16 @@ class _Samples:
         return sum(a.nbytes for a in (self.depth, self.trust, self.rays, self.basis.nodes, self.basis.weights))
 
     @staticmethod
-    def of(view: PosedDepth) -> _Samples:
+    def of(view: PosedDepth, grid: Grid) -> _Samples:
         xy, depth, trust = view.grid(SAMPLES_ACROSS)
         use = trust > 0.1
         center: Array = np.asarray(np.linalg.inv(view.cam_from_world)[:3, 3], np.float64)
         rays = view.in_world(xy[use], np.ones(int(use.sum()))) - center
-        basis = FINE.at(xy[use], view.intrinsics.width, view.intrinsics.height)
+        basis = grid.at(xy[use], view.intrinsics.width, view.intrinsics.height)
         return _Samples(depth[use], trust[use], rays, center, basis)
 
 
-def _pair_equations(i: int, j: int, samples: _Samples, other: PosedDepth, fields: Array) -> Equations:
+def _pair_equations(i: int, j: int, samples: _Samples, other: PosedDepth, fields: Array, how: FieldModel) -> Equations:
     """Samples of view i carried into view j: their depth there against what view j says."""
     depth = samples.depth * np.exp(samples.basis.of(fields[i]))
     along = samples.rays @ other.cam_from_world[2, :3] * depth
@@ -237,28 +266,29 @@ def _pair_equations(i: int, j: int, samples: _Samples, other: PosedDepth, fields
     seen = other.depth[place[:, 1], place[:, 0]].astype(np.float64)
     trust = other.trust[place[:, 1], place[:, 0]].astype(np.float64) * samples.trust
     use = inside & (seen > 0) & (z > 0) & (trust > 0.05)
-    there = FINE.at(place[use] + 0.5, other.intrinsics.width, other.intrinsics.height)
+    grid = how.prior.grid
+    there = grid.at(place[use] + 0.5, other.intrinsics.width, other.intrinsics.height)
     residual = np.log(z[use]) - np.log(seen[use]) - there.of(fields[j])
     near = np.abs(residual) < GROSS
     # A point moves along its ray: how much of that is depth in the other view.
     slope = (along[use] / z[use])[near]
     here, there = samples.basis[use][near], there[near]
     weights = np.concatenate([here.weights * slope[:, None], -there.weights], axis=1)
-    columns = np.concatenate([here.nodes + i * FINE.size, there.nodes + j * FINE.size], axis=1)
-    return Equations(columns, weights, residual[near], PAIR_SD / np.sqrt(trust[use][near]), SHARE)
+    columns = np.concatenate([here.nodes + i * grid.size, there.nodes + j * grid.size], axis=1)
+    return Equations(columns, weights, residual[near], how.pair_sd / np.sqrt(trust[use][near]), how.share)
 
 
-def _point_equations(n: int, view: PosedDepth, anchors: Anchors, fields: Array) -> Equations:
-    """The view's depth at triangulated points."""
+def _point_equations(n: int, view: PosedDepth, anchors: Anchors, fields: Array, how: FieldModel) -> Equations:
+    """The view's depth at points of known depth."""
     width, height = view.intrinsics.width, view.intrinsics.height
     inside = ((anchors.xy >= 0) & (anchors.xy < (width, height))).all(1)
-    xy, truth = anchors.xy[inside], anchors.depth[inside]
+    xy, truth, expected = anchors.xy[inside], anchors.depth[inside], anchors.sd[inside]
     place = xy.astype(int)
     seen = view.depth[place[:, 1], place[:, 0]].astype(np.float64)
     trust = view.trust[place[:, 1], place[:, 0]].astype(np.float64)
     use = (seen > 0) & (truth > 0) & (trust > 0.05)
-    basis = FINE.at(xy[use], width, height)
+    basis = how.prior.grid.at(xy[use], width, height)
     residual = np.log(seen[use]) + basis.of(fields[n]) - np.log(truth[use])
     near = np.abs(residual) < 2 * GROSS
-    sd = POINT_SD / np.sqrt(trust[use][near])
-    return Equations.of_places(n, basis[near], FINE.size, residual[near], sd, SHARE)
+    sd = expected[use][near] / np.sqrt(trust[use][near])
+    return Equations.of_places(n, basis[near], how.prior.grid.size, residual[near], sd, how.share)

@@ -32,13 +32,12 @@ def write_hard(name: str, folder: Path, data: Path) -> Path:
 
 def write_noisy_depth(source: Path, target: Path) -> None:
     """Each depth times its own factor (3 %) and a smooth field (6 %): what a good network does wrong."""
+    from tests.benchmarks.rooms.network import network_like
+
     target.mkdir(exist_ok=True)
     rng = np.random.default_rng(0)
     for path in sorted(source.glob("*.png")):
-        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float64)
-        field = rng.normal(size=(7, 9)).astype(np.float32)
-        field = cv2.resize(field, depth.shape[::-1], interpolation=cv2.INTER_CUBIC)
-        depth *= np.exp(rng.normal() * 0.03) * (1 + 0.06 * field / field.std())
+        depth = network_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float64), 6, rng, blur=0)
         cv2.imwrite(str(target / path.name), np.clip(np.round(depth), 0, 65535).astype(np.uint16))
 
 

@@ -108,7 +108,7 @@ MESHES = {
 
 @pytest.mark.parametrize("views", VIEWS.values(), ids=VIEWS)
 def test_depths_that_show_nothing(views: list[PosedDepth]) -> None:
-    none = Anchors(np.empty((0, 2)), NONE)
+    none = Anchors(np.empty((0, 2)), NONE, NONE)
     assert np.isfinite(fit_fields(views, {n: none for n in range(len(views))})).all()
     assert overlaps(views).shape == (len(views), len(views))
     assert len(neighbours(views)) <= 1

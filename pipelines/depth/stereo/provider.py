@@ -87,7 +87,7 @@ class MultiviewDepth:
         self._index = {int(f): i for i, f in enumerate(self._model.frame_ids)}
         self._frame = {f.id: f for f in sequence.frames}
         self._bands, self._threads, self._device = Bands(threads), threads if device == "cpu" else 1, device
-        self._camera: Intrinsics = sequence.calibration.intrinsics.at_most(side)
+        self.camera: Intrinsics = sequence.calibration.intrinsics.at_most(side)
         self._grey = LruCache(self._read_grey, _CACHED_FRAMES)
         self._raw = LruCache(self._load_raw, _CACHED_FRAMES)
         self._fused = LruCache(self._fuse, _CACHED_FRAMES)
@@ -120,7 +120,7 @@ class MultiviewDepth:
 
     def _sweep(self, index: int) -> NDArray[np.float32]:
         """(H, W) inverse depth of one keyframe from its neighbours alone; 0 where nothing matches."""
-        camera = self._camera
+        camera = self.camera
         companions = self._neighbours(index, _VIEWS)
         limits = depth_range(self._model, index, companions[:_RANGE_VIEWS])
         if len(companions) == 0 or limits is None:
@@ -151,6 +151,22 @@ class MultiviewDepth:
         filled, confidence = fill_unsure(borrowed, sure, self._small(index))
         depth = self._restore_supported(index, filled, sure < SURE)
         return upsample_depth(depth, confidence, self._sequence.image(frame))
+
+    def evidence(self, frame: Frame) -> DepthEstimate:
+        """Depths of a keyframe at the size that is matched, and how well other views bear them out; nothing is filled
+        in."""
+        return DepthEstimate(*self._fused(self._index[frame.id]))
+
+    def agreed(self, frame: Frame, depth_of: Callable[[Frame], NDArray[np.float32]]) -> NDArray[np.float32]:
+        """(h, w) mean of a depth that is given at the size that is matched, in the backbone's unit, and of its
+        neighbours' where they agree with it."""
+        index, own = self._index[frame.id], depth_of(frame)
+        companions = self._neighbours(index, _FUSE_VIEWS)
+        if len(companions) == 0:
+            return own
+        others = np.stack([depth_of(self._frame[int(i)]) for i in self._model.frame_ids[companions]])
+        warps, back = self._warps(index, companions), self._rows_back(index, companions)
+        return self._compare(own, others, warps, back, 2 * _TOLERANCE)[0]
 
     def _restore_supported(
         self, index: int, filled: NDArray[np.float32], unsure: NDArray[np.bool_]
@@ -203,7 +219,7 @@ class MultiviewDepth:
 
     def figures(self) -> dict[str, Any]:
         """The size that the images were matched at."""
-        return {"stereo_size": [self._camera.width, self._camera.height]}
+        return {"stereo_size": [self.camera.width, self.camera.height]}
 
     # what both use ----------------------------------------------------------------------------------------------
 
@@ -231,7 +247,7 @@ class MultiviewDepth:
         return choose_neighbours(self._model, camera, index, _LENDERS, _BEST_ANGLE)
 
     def _warps(self, index: int, others: NDArray[np.int64]) -> NDArray[np.float64]:
-        matrix, poses = self._camera.matrix, self._model.cam_from_world
+        matrix, poses = self.camera.matrix, self._model.cam_from_world
         return warps_to(matrix, poses[index], [matrix] * len(others), [poses[j] for j in others])
 
     def _rows_back(self, index: int, others: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -244,14 +260,14 @@ class MultiviewDepth:
     def _read_grey(self, frame_id: int) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
         rgb = self._sequence.read_image(self._frame[frame_id])
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-        size = self._camera.width, self._camera.height
+        size = self.camera.width, self.camera.height
         small = resize_area(np.asarray(grey, np.uint8), *size)
         return small.astype(np.float32) / np.float32(255), self._sequence.left_out(self._frame[frame_id], *size)
 
     def _read_small(self, index: int) -> NDArray[np.uint8]:
         """(h, w, 3) RGB at the size that is matched."""
         image = self._sequence.image(self._frame[int(self._model.frame_ids[index])])
-        return resize_area(image, self._camera.width, self._camera.height)
+        return resize_area(image, self.camera.width, self.camera.height)
 
     def _load_raw(self, index: int) -> NDArray[np.float32]:
         return invert(load_value(self._path(int(self._model.frame_ids[index]))))

@@ -7,6 +7,7 @@ to learn from.
     python -m tests.benchmarks.rooms video DIR --set judge --rooms 4        videos with their truth, DIR/video/SEED
     python -m tests.benchmarks.rooms learn DIR                              a learned choice, from the set `learn`
     python -m tests.benchmarks.rooms measure DIR NAME --choice              the depth that it chooses
+    python -m tests.benchmarks.rooms measure DIR NAME --network 6           fused with a network that is off by 6 %
 
 A default about depth is chosen on `choose` and reported on `judge`. A room is a seed: walls, textures, light, furniture
 (of Debian's `sweethome3d-furniture`, downloaded by apt-get or given by --package; none of it is in the repository), a
@@ -29,11 +30,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.tensors import save_arrays
+from msgs_slam.pipelines.depth.fused import FusedDepth
+from msgs_slam.pipelines.depth.scale import measure_scale
+from msgs_slam.pipelines.providers import DepthEstimate, DepthProvider, Sequence
 
 from .choice.completion import Completion
 from .choice.model import load_model
 from .clip import Clip, make_clip
 from .furniture import furniture
+from .network import NetworkLike
 from .room import KINDS, kind_of
 from .video import make_video
 
@@ -92,17 +97,24 @@ def learn_choice(folder: Path, most: int) -> None:
     save_arrays(folder / MODEL, learn(evidence, errors, rooms, np.isin(rooms, chosen)).weights())
 
 
-def measure(folder: Path, seeds: list[int], name: str, choice: bool = False) -> None:
-    """Keep depth (0: none) and confidence of every keyframe by the product as it is, or by the learned choice."""
+def measure(folder: Path, seeds: list[int], name: str, choice: bool, network: float, alone: bool) -> None:
+    """Keep depth (0: none) and confidence of every keyframe by the product as it is, by the learned choice, or with a
+    network (0: without) that is off by `network` per cent, fused as in a run, or that network alone."""
     target = folder / "depth" / name
     target.mkdir(parents=True, exist_ok=True)
     for seed in seeds:
         if (target / f"{seed}.npz").exists():
             continue
-        provider, frames = Clip.load(folder / f"{seed}.npz").stereo(folder / "stereo" / str(seed))
+        clip = Clip.load(folder / f"{seed}.npz")
+        sequence = clip.sequence()
+        provider, frames = clip.stereo(folder / "stereo" / str(seed))
+        learned = NetworkLike(dict(enumerate(clip.truth)), network, seed)
         start = time.process_time()
         completion = Completion(provider, load_model(folder / MODEL) if choice else None)
-        found = [completion.estimate(f.id) if choice else provider.estimate(f) for f in frames]
+        if network:
+            found = in_unit_of_poses(sequence, learned if alone else FusedDepth(learned, provider, sequence))
+        else:
+            found = [completion.estimate(f.id) if choice else provider.estimate(f) for f in frames]
         spent = (time.process_time() - start) / len(frames)
         depth, confidence = np.stack([f.depth for f in found]), np.stack([f.confidence for f in found])
         np.savez_compressed(
@@ -111,6 +123,14 @@ def measure(folder: Path, seeds: list[int], name: str, choice: bool = False) -> 
             confidence=confidence.astype(np.float16),
             spent=spent,
         )
+
+
+def in_unit_of_poses(sequence: Sequence, provider: DepthProvider) -> list[DepthEstimate]:
+    """The depths of all frames, after one scale by the sparse points."""
+    provider.fit(sequence.frames)
+    found = {f.id: provider.estimate(f) for f in sequence.frames}
+    scale = measure_scale(sequence, sequence.frames, lambda f: found[f.id])
+    return [scale.in_backbone_unit(estimate) for estimate in found.values()]
 
 
 def table(folder: Path, seeds: list[int], names: list[str]) -> None:
@@ -139,12 +159,12 @@ def table(folder: Path, seeds: list[int], names: list[str]) -> None:
         print(f"new / old: L1 {ratio[1]:.3f}, error of unsure pixels {ratio[4]:.3f}, sure pixels off {ratio[3]:.3f}")
 
 
-COLUMNS = ("unsure %", "L1 cm", "off %", "sure off %", "unsure error %", "unsure off %", "<2% off %", "CPU s")
+COLUMNS = ("unsure %", "L1 cm", "off %", "sure off %", "unsure error %", "unsure off %", "<2% off %", "L1 %", "CPU s")
 
 
 def figures(depth: NDArray, confidence: NDArray, truth: NDArray, unsure: NDArray) -> tuple[float, ...]:
     """Of a room, as COLUMNS; "unsure error" is the mean of |log depth ratio|, at most 1; "<2% off": of the pixels of
-    the highest confidence (0.4 or more) those that are off."""
+    the highest confidence (0.4 or more) those that are off; "L1 %": of the median depth."""
     known = truth > 0
     unsure = unsure & known
     shown = np.where(depth > 0, depth, 1e-3)
@@ -152,7 +172,8 @@ def figures(depth: NDArray, confidence: NDArray, truth: NDArray, unsure: NDArray
     metres, off, guess = np.abs(depth - truth)[known], error > np.log(1 + OFF), unsure[known]
     sure, trusted = ~guess, confidence[known] >= 0.4
     shares = [100 * guess.mean(), 100 * metres.mean(), 100 * off.mean(), 100 * off[sure].mean()]
-    return (*shares, 100 * error[guess].mean(), 100 * off[guess].mean(), 100 * off[trusted].mean())
+    guesses, of_median = [100 * error[guess].mean(), 100 * off[guess].mean()], metres.mean() / np.median(truth[known])
+    return (*shares, *guesses, 100 * off[trusted].mean(), 100 * of_median)
 
 
 def _print(title: str, rows: list[dict[str, NDArray]], summary: object) -> None:
@@ -170,6 +191,8 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME")
     parser.add_argument("--set", choices=SETS, default="choose")
     parser.add_argument("--choice", action="store_true", help="measure the learned choice, not the product")
+    parser.add_argument("--network", type=float, default=0, metavar="PERCENT", help="measure it fused with a network")
+    parser.add_argument("--alone", action="store_true", help="that network without the stereo")
     parser.add_argument("--rooms", type=int, default=0, help="only the first so many of the set")
     parser.add_argument("--package", type=Path, help="the .deb file of the furniture")
     given = parser.parse_args()
@@ -178,7 +201,7 @@ def main() -> None:
         return make_videos(given.folder, given.set, given.package, given.rooms)
     seeds = seeds_of(given.folder, given.set, given.what == "make", given.package, given.rooms)
     if given.what == "measure":
-        measure(given.folder, seeds, *given.names, choice=given.choice)
+        measure(given.folder, seeds, *given.names, given.choice, given.network, given.alone)
     elif given.what == "table":
         table(given.folder, seeds, given.names)
     elif given.what == "learn":

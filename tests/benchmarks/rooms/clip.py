@@ -67,19 +67,23 @@ class Clip:
         focal = self.focal * width
         return Intrinsics(width, height, focal, focal, width / 2, height / 2)
 
-    def stereo(self, folder: Path) -> tuple[MultiviewDepth, list[Frame]]:
-        """The product's stereo, its first pass done; that is kept in the folder."""
+    def sequence(self) -> Sequence:
+        """The frames and what structure from motion would know of them."""
         frames = [Frame(i, f"{i:06d}.png", i / 3, i, 1.0) for i in range(len(self.images))]
         model = SparseModel(
             np.arange(len(frames), dtype=np.int64), self.cam_from_world, self.points, self.colors, self.obs_frame,
             self.obs_point, self.obs_xy,
         )  # fmt: skip
         calibration = Calibration(self.camera, "given", 0.0, (0.0, 0.0, 0.0, 0.0))
-        sequence = Sequence(frames, calibration, self.camera, model, lambda f: self.images[f.id])
+        return Sequence(frames, calibration, self.camera, model, lambda f: self.images[f.id])
+
+    def stereo(self, folder: Path) -> tuple[MultiviewDepth, list[Frame]]:
+        """The product's stereo, its first pass done; that is kept in the folder."""
+        sequence = self.sequence()
         folder.mkdir(parents=True, exist_ok=True)
         provider = MultiviewDepth(sequence, self.camera.width, PLANES, lambda: folder, 1, SilentProgress())
-        provider.fit(frames)
-        return provider, frames
+        provider.fit(sequence.frames)
+        return provider, sequence.frames
 
 
 def make_clip(seed: int, catalogue: Catalogue) -> Clip | None:

@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from proxy_room import UNIT, Room, write_source
@@ -11,7 +12,7 @@ from proxy_room import UNIT, Room, write_source
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
 from msgs_slam.pipelines.config import ProxyConfig
-from msgs_slam.pipelines.depth.fused import FusedDepth, fuse
+from msgs_slam.pipelines.depth.fused import FusedDepth, fuse, sharpen_steps
 from msgs_slam.pipelines.depth.scale import measure_scale
 from msgs_slam.pipelines.depth.stereo.neighbours import depth_range
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
@@ -133,8 +134,39 @@ def test_fused_depth_is_metric_and_better_than_either(room: Room, stereo: Multiv
         table.append([[e.mean(), np.median(e)] for e in (together, network, geometry)])
     together, network, geometry = np.mean(table, axis=0)
     assert (together > 0).all()
-    assert (together < 0.75 * network).all()
+    assert (together < 0.17 * network).all()
     assert (together < np.add(geometry, [0, 1e-5])).all()
+
+
+class Poor(Learned):
+    """A network that takes bright for near, alike in all frames."""
+
+    def estimate(self, frame: Frame) -> DepthEstimate:
+        view = self._room.views[frame.id]
+        depth = (3 * np.exp(-view.rgb.mean(-1) / 128)).astype(np.float32)
+        return DepthEstimate(depth, np.full(depth.shape, 0.5, np.float32))
+
+
+def test_a_poor_network_changes_little(room: Room, stereo: MultiviewDepth) -> None:
+    fused = FusedDepth(Poor(room), stereo, room.sequence())
+    fused.fit(room.frames)
+    scale = measure_scale(room.sequence(), room.frames, fused.estimate).value * UNIT
+    together = [relative_errors(room, fused.estimate(f), f, scale).mean() for f in room.frames[2:9:2]]
+    geometry = [relative_errors(room, stereo.estimate(f), f).mean() for f in room.frames[2:9:2]]
+    assert 0 < np.mean(together) < np.mean(geometry)
+
+
+def test_blurred_steps_of_depth_are_steps_again_and_slopes_stay() -> None:
+    y, x = np.indices((120, 160))
+    slope = 2 + 0.004 * x + 0.002 * y
+    truth = np.where(x < 80, slope, 1.6 * slope)
+    blurred = (1 / cv2.GaussianBlur(1 / truth, (0, 0), 0.8)).astype(np.float32)
+    blurred[:10, :10] = 0
+    sharp = sharpen_steps(blurred)
+    before, after = (np.abs(d / truth - 1)[10:, 70:90].mean() for d in (blurred, sharp))
+    assert 0 < after < 0.25 * before
+    np.testing.assert_allclose(sharp[:, :70], blurred[:, :70], rtol=1e-6)
+    assert (sharp[blurred == 0] == 0).all()
 
 
 @pytest.mark.parametrize(
@@ -161,23 +193,25 @@ def test_two_guesses_that_miss_differently_are_better_together() -> None:
     guess = whole.copy()
     guess[:, 40:], confidence[:, 40:] = 2.2, 0.1  # the geometry guesses 10 % too far
     guess[20:40, 60:] = 6.0  # and there wildly
-    learned = DepthEstimate((whole * np.where(np.arange(80) < 40, 1.0, 0.95)).astype(np.float32), np.ones_like(whole))
-    fused = fuse(learned, DepthEstimate(guess, confidence), 1.0, 1.0)
+    strays = 1 + 0.08 * (-1.0) ** np.arange(60)[:, None]  # a poor network
+    depth = (whole * np.where(np.arange(80) < 40, strays, 0.95)).astype(np.float32)
+    learned = DepthEstimate(depth, np.ones_like(whole))
+    fused = fuse(learned.depth, learned, DepthEstimate(guess, confidence))
     error = np.abs(fused.depth / whole - 1)
-    assert error[:, :36].max() < 1e-3
-    assert error[:15, 66:].max() < 0.06
+    assert error[:, :40].max() < 3e-3
+    assert error[:15, 66:].max() < 0.05
     assert fused.depth[:15, 66:].min() > 0.95 * 2.0  # between the two
     assert np.abs(fused.depth[22:38, 66:] / whole[22:38, 66:] - 0.95).max() < 0.01
 
 
-def test_the_scale_field_of_a_portrait_image_is_that_of_a_landscape_one_on_its_side() -> None:
+def test_a_portrait_image_is_fused_like_a_landscape_one_on_its_side() -> None:
     rng = np.random.default_rng(3)
     ratio, confidence = np.exp(rng.normal(0, 0.05, (48, 96))), np.where(rng.random((48, 96)) < 0.3, 0.9, 0.0)
 
     def fused(turns: int) -> np.ndarray:
         geometry = DepthEstimate(*(np.rot90(a, turns).astype(np.float32) for a in (2 * ratio, confidence)))
         learned = DepthEstimate(np.full_like(geometry.depth, 2.0), np.ones_like(geometry.depth))
-        return np.rot90(fuse(learned, geometry, 1.0, 1.0).depth, -turns)
+        return np.rot90(fuse(learned.depth, learned, geometry).depth, -turns)
 
     np.testing.assert_allclose(fused(1), fused(0), rtol=1e-5)
 
