@@ -20,6 +20,7 @@ from msgs_slam.pipelines import outcome
 from msgs_slam.pipelines.engine import stages
 from msgs_slam.pipelines.mapping import submap_tasks
 from msgs_slam.pipelines.render import api, cpu, inspection
+from msgs_slam.pipelines.render.notes import Notes
 
 DEVICE = "meta"
 _COPIES = {torch.ops.aten.copy_.default, torch.ops.aten._to_copy.default}
@@ -129,7 +130,7 @@ class PretendBackend:
 
     @staticmethod
     def composite(*arguments: Any) -> tuple[torch.Tensor, ...]:
-        """As a backend's: six tensors, width, height, and the least depth."""
+        """As a backend's: six tensors, width, height, the least depth, and notes or None."""
         values = [_taken(x) for x in arguments[:6]]
         return _Composite.apply(arguments[6:], *values)
 
@@ -154,14 +155,22 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rest: tuple[Any, ...], *values: PretendTensor) -> tuple[torch.Tensor, ...]:
         ctx.inputs = [v.inner.detach().contiguous().requires_grad_() for v in values]
+        *size, ctx.notes = rest
+        counted = None if ctx.notes is None else ctx.notes.counted
+        ctx.inner_notes = None if ctx.notes is None else Notes(None if counted is None else counted.inner)
         with torch.enable_grad():
-            ctx.outputs = cpu.composite(*ctx.inputs, *rest)
+            ctx.outputs = cpu.composite(*ctx.inputs, *size, ctx.inner_notes)
         return tuple(PretendTensor(x.detach()) for x in ctx.outputs)
 
     @staticmethod
     def backward(ctx: Any, *gradients: PretendTensor) -> tuple[Any, ...]:
         given = [g.inner.contiguous() for g in gradients]
+        if ctx.notes is not None:
+            ctx.inner_notes.errors = ctx.notes.errors.inner
         found = torch.autograd.grad(ctx.outputs, ctx.inputs, given, allow_unused=True)
+        if ctx.notes is not None:
+            noted = (ctx.inner_notes.largest, ctx.inner_notes.answered)
+            ctx.notes.largest, ctx.notes.answered = (PretendTensor(x) for x in noted)
         return (None, *(None if g is None else PretendTensor(g) for g in found))
 
 

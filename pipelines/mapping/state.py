@@ -180,7 +180,8 @@ class MapParameters:
         self.class_logits = torch.cat([self.class_logits, seeds.class_logits])
         self.anchor_frame_ids = torch.cat([self.anchor_frame_ids, seeds.anchor_frame_ids])
         self.trust = torch.cat([self.trust, trust])
-        self.noted = torch.cat([self.noted, self.noted.new_tensor([[weight, 0.0]]).expand(len(trust), 2)])
+        added = torch.stack([torch.full_like(trust, weight), torch.zeros_like(trust)], 1)
+        self.noted = torch.cat([self.noted, added])
 
     def to_tensors(self) -> dict[str, Tensor]:
         """A flat table for a snapshot."""
