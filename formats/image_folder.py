@@ -1,7 +1,6 @@
 """The images of a folder: which they are, their order, and when they were taken."""
 
 import re
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 from .errors import InputError
 from .images import IMAGE_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES, exif_time, read_rgb
 from .reading import reaching
-from .textfile import read_rows
+from .textfile import is_number, read_rows
 
 _LIST_NAMES = ("timestamps.txt", "times.txt", "rgb.txt")
 
@@ -98,7 +97,7 @@ def _from_list(path: Path, images: list[Path]) -> NDArray[np.float64]:
     rows = read_rows(path)
     try:
         if rows and all(len(row) >= 2 for row in rows):
-            time, name = (0, 1) if _is_number(rows[0][0]) else (1, 0)
+            time, name = (0, 1) if is_number(rows[0][0]) else (1, 0)
             by_name = {Path(row[name]).name: float(row[time]) for row in rows}
             return np.array([by_name[p.name] for p in images], dtype=np.float64)
         times = np.array([float(row[0]) for row in rows], dtype=np.float64)
@@ -114,13 +113,6 @@ def _from_list(path: Path, images: list[Path]) -> NDArray[np.float64]:
         f"{path} has {len(times)} times for {len(images)} images, and their names hold no row numbers: "
         "give one line for each image, or remove the file"
     )
-
-
-def _is_number(text: str) -> bool:
-    with suppress(ValueError):
-        float(text)
-        return True
-    return False
 
 
 def _require_increasing(times: NDArray[np.float64], path: Path) -> NDArray[np.float64]:

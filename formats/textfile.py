@@ -51,10 +51,11 @@ def read_rows(path: Path) -> list[list[str]]:
     """
     lines = (_COMMENT.split(line, 1)[0].replace(",", " ").split() for line in read_text(path).splitlines())
     rows = [line for line in lines if line]
-    return rows[1:] if len(rows) > 1 and not any(map(_is_number, rows[0])) else rows
+    return rows[1:] if len(rows) > 1 and not any(map(is_number, rows[0])) else rows
 
 
-def _is_number(field: str) -> bool:
+def is_number(field: str) -> bool:
+    """Return whether a field of a table is a number, as Python writes them."""
     try:
         float(field)
     except ValueError:

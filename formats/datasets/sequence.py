@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..images import read_depth_png, read_label_png, read_rgb
 from ..reading import parsing
-from ..textfile import read_json, read_text
+from ..textfile import is_number, read_json, read_text
 
 _TABLE_NAME = "scannetv2-labels.combined.tsv"
 _LEVELS_UP = 4
@@ -329,16 +329,11 @@ def _from_text(text: str) -> dict[int, LabelClass]:
     lines = lines[: lines.index("")] if "" in lines else lines
     rows = [line.split() for line in lines]
     if all(len(r) >= 2 and r[0].isdecimal() for r in rows):
-        return {int(r[0]): LabelClass(int(r[0]), " ".join(takewhile(_is_word, r[1:])) or r[1]) for r in rows}
+        return {
+            int(r[0]): LabelClass(int(r[0]), " ".join(takewhile(lambda field: not is_number(field), r[1:])) or r[1])
+            for r in rows
+        }
     return {i: LabelClass(i, line) for i, line in enumerate(lines)}
-
-
-def _is_word(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return True
-    return False
 
 
 def find_label_table(path: Path) -> Path | None:

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -30,7 +29,6 @@ _FLOOR = 1 / (math.exp(SEED_LOGIT) - 1)
 _MIN_VOTES = 1e-6
 """Pixels: who has less of all views keeps the classes that he has."""
 
-T = TypeVar("T")
 MAP_RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2}
 """Learning rates of Adam, of positions in radii of the Gaussian: what is small has to be placed finely."""
 HALVES_ROOM = 250e6

@@ -84,9 +84,8 @@ def unwrapped(mesh: MeshArrays, texels_per_unit: float, most: int) -> Atlas:
     for part, first, (_, of_part, _) in zip(parts, firsts, pieces, strict=False):
         faces[part] = of_part + first
     uv = np.concatenate([of_part for _, _, of_part in pieces])
-    shrunk = min(
-        most / max(atlas.width, atlas.height, 1), 1.0
-    )  # how well charts fill a square is known afterwards only
+    # How well charts fill a square is known afterwards only.
+    shrunk = min(most / max(atlas.width, atlas.height, 1), 1.0)
     width, height = max(int(atlas.width * shrunk), 1), max(int(atlas.height * shrunk), 1)
     corners = uv * np.array([width, height], np.float64)
     return Atlas(mesh, corners, vertex.astype(np.int64), faces, width, height)
