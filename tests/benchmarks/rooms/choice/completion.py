@@ -122,5 +122,5 @@ class Completion:
         return DepthEstimate(np.where(sure, depth, chosen.depth), np.where(sure, confidence, trust))
 
     def _halve(self, index: int) -> Half:
-        size = -(-self._of._camera.width // 2), -(-self._of._camera.height // 2)
+        size = -(-self._of.camera.width // 2), -(-self._of.camera.height // 2)
         return halved(*self._of._fused(index), resize_area(self._of._small(index), *size), self._of._contrast(index))
