@@ -81,7 +81,9 @@ class Clip:
         """The product's stereo, its first pass done; that is kept in the folder."""
         sequence = self.sequence()
         folder.mkdir(parents=True, exist_ok=True)
-        provider = MultiviewDepth(sequence, self.camera.width, PLANES, lambda: folder, 1, SilentProgress())
+        provider = MultiviewDepth(
+            sequence, max(self.camera.width, self.camera.height), PLANES, lambda: folder, 1, SilentProgress()
+        )
         provider.fit(sequence.frames)
         return provider, sequence.frames
 
