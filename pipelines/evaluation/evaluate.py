@@ -16,7 +16,7 @@ from ..mapping.division import split_frames
 from ..outcome import Outcome, spread_sample
 from ..render.api import Rendering, render
 from ..sfm.lens import FramePixels
-from ..system.progress import Progress, SilentProgress
+from ..system.progress import Progress, SilentProgress, log
 from ..types import Trajectory
 from .image_quality import DepthErrorSum, open_lpips, psnr, ssim
 from .labels import ClassMap, Counts, Matching, count_labels, label_cells, match_classes
@@ -69,7 +69,7 @@ def evaluate_outcome(
     """Compute all figures, as plain JSON values; a group that cannot be had is {"missing": why}.
 
     At most `max_views` of the keyframes, and as many of the other frames, are rendered. Raises InputError for a truth
-    of which no frame belongs to the run, and for a class map that does not fit.
+    of which no frame belongs to the run, and for a class map that joins nothing here.
     """
     matched = match_truth(outcome.frames, outcome.source_is_folder, truth)
     if not matched.has_pose.any() and not (matched.image >= 0).any():
@@ -78,7 +78,10 @@ def evaluate_outcome(
             f"{outcome.run.root} by name or by time. Is it the truth of another recording?"
         )
     if class_map is not None:
-        class_map.require_known((*outcome.classes.names, *outcome.vocabulary), truth.class_names)
+        unknown = class_map.unknown((*outcome.classes.names, *outcome.vocabulary), truth.class_names)
+        if unknown:
+            listed = ", ".join(unknown)
+            log.warning("class map %s: there is no class %s. What joins only these is left out", class_map.name, listed)
     matching = match_classes(outcome.classes.names, outcome.vocabulary, truth.class_names, class_map)
     trajectory, alignment = trajectory_cells(outcome, matched)
     why = {"missing": f"mapping is not done; the last stage is {outcome.pose_stage}"}

@@ -173,16 +173,18 @@ class ClassMap:
         )
         return Matching(titles, of_ours, of_truth, f"by {self.name}")
 
-    def require_known(self, vocabulary: Iterable[str], true_names: tuple[str, ...]) -> None:
-        """Raise InputError for a name that is neither a class of the run's, or of the maps that come with the
-        program, nor one of the truth's."""
+    def unknown(self, vocabulary: Iterable[str], true_names: tuple[str, ...]) -> list[str]:
+        """Which names, each with the nearest known one, are neither classes of the run's, or of the maps that come with
+        the program, nor the truth's: entries of them join nothing."""
         shipped = shipped_maps()
         ours = {*_lower(vocabulary), *(o for m in shipped for o, _ in m.pairs)}
         theirs = {*_lower(true_names), *self.truth}
-        for name, others in self.pairs:
-            _require(name, ours, f"{self.name}: the run knows no class")
-            for other in others:
-                _require(other, theirs, f"{self.name}: the truth has no class")
+        return [
+            *(f"{_named(o, ours)} of the run" for o, _ in self.pairs if o not in ours),
+            *dict.fromkeys(
+                f"{_named(t, theirs)} of the truth" for _, others in self.pairs for t in others if t not in theirs
+            ),
+        ]
 
 
 def read_class_map(path: Path) -> ClassMap:
@@ -246,12 +248,9 @@ def _fits(map_: ClassMap, vocabulary: tuple[str, ...], true_names: tuple[str, ..
     return bool(true_names) and set(_lower(true_names)) <= theirs and known >= min(10, len(vocabulary) / 2)
 
 
-def _require(name: str, known: set[str], problem: str) -> None:
-    if name in known:
-        return
+def _named(name: str, known: set[str]) -> str:
     near = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]!r}?" if near else f"known: {_some(sorted(known))}"
-    raise InputError(f"{problem} {name!r}; {hint} Correct that line, or take it out")
+    return f"{name!r} (did you mean {near[0]!r}?)" if near else repr(name)
 
 
 def _lower(names: Iterable[str]) -> list[str]:

@@ -66,6 +66,21 @@ def test_every_place_gives_one_psnr(finished_run: FinishedRun, copied_run: Calla
     assert keyframe_psnr({"frames": records["frames"]}) is None
 
 
+def test_a_class_map_of_another_vocabulary_is_warned_of(
+    finished_run: FinishedRun, copied_run: Callable[[str], Path], tmp_path: Path
+) -> None:
+    run, mine = copied_run("run.msgs"), tmp_path / "mine.toml"
+    mine.write_text('[classes]\nwall = ["wall", "stucco"]\nairship = "wall"\n')
+    result = invoke("evaluate", run, "--truth", finished_run.truth, "--class-map", mine)
+    assert result.exit_code == 0, result.stderr
+    assert "class map mine: there is no class 'airship' of the run, 'stucco' of the truth." in result.stderr
+    assert json.loads((run / "evaluation" / "evaluation.json").read_text())["labels"]["classes"] == ["wall"]
+    mine.write_text('[classes]\nairship = "wall"\n')
+    refused = invoke("evaluate", run, "--truth", finished_run.truth, "--class-map", mine)
+    assert refused.exit_code == 1
+    assert "mine: joins none of the run's classes" in refused.stderr
+
+
 def test_changed_setting_then_ctrl_c(finished_run: FinishedRun, copied_run: Callable[[str], Path]) -> None:
     run = copied_run("run.msgs")
     assert states(run) == dict.fromkeys(("frames", "tracking", *LATER), "done")
