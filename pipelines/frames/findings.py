@@ -83,6 +83,12 @@ def warn_of_structure(context: StageContext, structure: Structure, ids: list[int
         context.warn(
             f"structure from motion could not place {report.total - report.registered} of {report.total} keyframes"
         )
+    if structure.loose:
+        named = stretches(ids[k] for k in structure.loose)
+        context.warn(
+            f"{len(structure.loose)} of them (frames {named}) show too little to determine their poses, such as a "
+            "strip of floor below a bare wall: they were left out, and tracking searches for them again"
+        )
     for piece in structure.pieces:
         inside = sorted(ids[i - 1] for i in piece.reg_image_ids())
         context.warn(

@@ -21,6 +21,7 @@ from ..geometry.sparse_model import SparseModel
 from ..mapping.move_map import follow_keyframes
 from ..run.files import CALIBRATION, EVERY_FRAME, FEATURES, FRAMES
 from ..run.folder import RunFolder
+from ..sfm.adjust import FEATURE_SD
 from ..sfm.lens import distorted_camera, make_lens, to_pycolmap
 from ..sfm.rolling import Shutter, velocities
 from ..source.faces import find_faces
@@ -33,7 +34,7 @@ from ..tracking.adjust import settle
 from ..tracking.front_end import FrontEnd
 from ..tracking.pictures import Pictures
 from ..tracking.pnp import FramePose, group_by_points, predict_pose, recognise
-from ..tracking.state import FEATURE_SD, NO_SIGHTINGS, Sightings, TrackState
+from ..tracking.state import NO_SIGHTINGS, Sightings, TrackState
 from ..types import Array, Features, Trajectory
 
 Image = NDArray[np.uint8]

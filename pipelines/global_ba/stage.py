@@ -29,13 +29,14 @@ from ..run.files import (
     TRAJECTORY,
 )
 from ..run.folder import RunFolder
+from ..sfm.adjust import FEATURE_SD
 from ..sfm.bundle import reprojection_errors
 from ..sfm.retrieval import GlobalDescriptors, compute_global_descriptors, unit
 from ..system.parallel import LruSequence
 from ..system.values import load_value, save_value
 from ..tracking.adjust import align_depths, without_dependent_depth
 from ..tracking.pictures import Pictures, load_shutter
-from ..tracking.state import FEATURE_SD, TrackState, to_sparse_model
+from ..tracking.state import TrackState, to_sparse_model
 from ..types import VOID, Array, Intrinsics, Trajectory
 from .between import pose_every_frame
 from .candidates import LabelSummary, loop_candidates, summarise_labels

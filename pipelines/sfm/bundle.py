@@ -171,13 +171,12 @@ class Problem:
     def linearise(self, motions: Array, points: Array) -> tuple[Array, ...]:
         return kernels.linearise(motions, points, self.data)
 
-    def solve(
+    def reduced(
         self, at: tuple[Array, Array], normal: tuple[Array, ...], damping: float
-    ) -> tuple[Array, Array] | None:  # fmt: skip
-        """Steps of cameras (N, 6) and points (P, 3) from the motions and points at which the normal equations were
-        made; None where the system is not positive definite."""
+    ) -> tuple[Array, Array, Array]:  # fmt: skip
+        """The system over the cameras alone: blocks (B, 6, 6) at `pairs`, the right side (6 N,), and the inverse blocks
+        (P, 3, 3) of the points that were eliminated."""
         cam_block, cam_right, point_block, point_right = normal
-        n = len(cam_block)
         blocks, right = np.zeros((len(self.pairs), 6, 6)), cam_right.ravel().copy()
         diagonal = np.einsum("nii->ni", cam_block)
         own = self.rows[:-1]
@@ -187,6 +186,15 @@ class Problem:
         inverse = kernels.invert_points(point_block, damping)
         index = self.rows, np.ascontiguousarray(self.pairs[:, 1])
         kernels.eliminate_points(*at, self.data, self.starts, inverse, point_right, *index, blocks, right)
+        return blocks, right, inverse
+
+    def solve(
+        self, at: tuple[Array, Array], normal: tuple[Array, ...], damping: float
+    ) -> tuple[Array, Array] | None:  # fmt: skip
+        """Steps of cameras (N, 6) and points (P, 3) from the motions and points at which the normal equations were
+        made; None where the system is not positive definite."""
+        n, point_right = len(normal[0]), normal[3]
+        blocks, right, inverse = self.reduced(at, normal, damping)
         pairs, turns, place = self.pairs, None, np.arange(n)
         if len(self.rig) > 1:
             blocks, pairs, right, place, turns = tie_cameras(blocks, pairs, right, self.ids, self.rig)

@@ -25,6 +25,7 @@ from .given import bare_model, set_best_focal
 from .lens import set_lens
 from .matching import VerifiedPair, match_pair
 from .parallax import require_parallax, why_no_structure
+from .pose_groups import loose_cameras
 from .retrieval import (
     GlobalDescriptors,
     compute_global_descriptors,
@@ -33,7 +34,7 @@ from .retrieval import (
     loop_pairs,
     sequential_pairs,
 )
-from .rolling import NO_READOUT, Readout, adjust_rolling, read_readout
+from .rolling import NO_READOUT, Readout, RollingModel, adjust_rolling, read_readout
 from .seams import cut, remove_keyframes
 from .snapshots import Snapshots, features_name, pairs_name
 from .windows import WindowModels, adjust_joined
@@ -55,6 +56,7 @@ class Structure:
     No point is seen from two of the report's parts: the transform between them is unknown. `tried` are the pairs
     of keyframes that were matched, `pairs` those of them that obey one geometry. `pieces` are further models, in the
     same camera, of keyframes that the ones before could not place, each with a world and a unit of its own.
+    `loose` were left out again: see `loose_cameras`.
     """
 
     model: pycolmap.Reconstruction
@@ -67,6 +69,7 @@ class Structure:
     pairs: list[VerifiedPair]
     pieces: list[pycolmap.Reconstruction]
     readout: Readout = NO_READOUT
+    loose: Sequence[int] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,11 +112,36 @@ class StructureFromMotion(Candidates):
         if found is None:
             raise InputError(why_no_structure(len(features), pairs))
         found, pieces = self._largest_first(found, self._pieces(views, pairs, found.model, apart), views)
-        report = judge(found.model, pairs, views.xy, self._places(features), self.config.overlap)
-        cut(found.model, report.parts, report.total)
+        report, loose = self._in_parts(found.model, views, pairs)
         return Structure(
-            found.model, report, found.mapper, found.focal_sd, features, vocabulary, tried, pairs, pieces, found.readout
-        )
+            found.model, report, found.mapper, found.focal_sd, features, vocabulary, tried, pairs, pieces,
+            found.readout, loose,
+        )  # fmt: skip
+
+    def _in_parts(
+        self, model: pycolmap.Reconstruction, views: KeyframeSet, pairs: Sequence[VerifiedPair]
+    ) -> tuple[ModelReport, list[int]]:
+        """The report on a model, whose parts share no point from now on, and the loose keyframes it is now without."""
+        loose: list[int] = []
+        while True:
+            report = judge(model, pairs, views.xy, self._places(views.xy), self.config.overlap)
+            cut(model, report.parts, report.total)
+            found = [] if loose else self._loose(model, views, report)
+            if not found:
+                return report, loose
+            loose = found
+            remove_keyframes(model, loose)
+
+    def _loose(self, model: pycolmap.Reconstruction, views: KeyframeSet, report: ModelReport) -> list[int]:
+        """Keyframes whose poses the images do not determine: see `loose_cameras`. Panoramas see all around: none."""
+        if len(self.cam_from_rig) > 1 or not model.num_points3D():
+            return []
+        rolling = RollingModel(model, views.xy, views.times)
+        bundle, _, pinhole = rolling.bundle()
+        number = {i - 1: n for n, i in enumerate(rolling.images)}
+        parts = [[number[k] for k in part] for part in report.parts]
+        loose, _ = loose_cameras(bundle, pinhole, parts, self.config.least_piece, range(len(number)))
+        return [rolling.images[n] - 1 for n in loose]
 
     def _as_given(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
         """The given poses as they are, without a point."""

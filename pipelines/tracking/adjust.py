@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,10 @@ from ..geometry import se3
 from ..geometry.camera import project
 from ..geometry.sparse_model import SparseModel
 from ..sfm.bundle import Bundle, adjust_bundle, adjust_pose
+from ..sfm.pose_groups import loose_cameras
 from ..sfm.rolling import rectified_bundle, rectified_pixels, velocities
 from ..types import Array, Intrinsics, ProxyMaps, rows_by
+from .pnp import MAX_GAP
 from .state import Sightings, TrackState, sync_rig_poses
 
 LoadProxy = Callable[[int], ProxyMaps | None]
@@ -50,11 +53,12 @@ class DepthTies:
 
 @dataclass(frozen=True)
 class Report:
-    """Results of the adjustment for the stage's report."""
+    """Results of the adjustment: figures for the stage's, and the bundle of these frames with the depths that count."""
 
     figures: dict[str, Any]
     frame_ids: list[int]
     ties: DepthTies
+    bundle: Bundle
 
 
 def without_dependent_depth(settings: TrackingConfig, proxy_report: Mapping[str, Any]) -> TrackingConfig:
@@ -100,7 +104,36 @@ def adjust_state(
         "cost_before": initial,
         "cost_after": result.cost,
     }
-    return Report(figures, frame_ids, ties)
+    return Report(figures, frame_ids, ties, with_depths(bundle, ties, intrinsics, settings))
+
+
+def drop_loose(
+    state: TrackState, report: Report, intrinsics: Intrinsics, least: int
+) -> tuple[list[int], list[list[int]]]:
+    """Lose, in place, the frames whose poses neither images nor metric depths determine against the rest of their
+    segment, in groups of fewer than `least` keyframes; returns them, and the groups that stay: see `loose_cameras`.
+
+    Frames that were not adjusted themselves go with the keyframes beside them. One or two between others stay.
+    """
+    ids = report.frame_ids
+    if len(state.rig) > 1:  # a panorama sees all around
+        return [], []
+    parts: dict[int, list[int]] = {}
+    for k in np.unique(report.bundle.obs_cam).tolist():
+        parts.setdefault(state.segment[ids[k]], []).append(k)
+    keyframes = set(state.keyframes)
+    counted = {k for k, i in enumerate(ids) if i in keyframes}
+    found, apart = loose_cameras(report.bundle, intrinsics, parts.values(), least, counted)
+    loose = {ids[k] for k in found}
+    others = sorted(set(state.poses).difference(ids))
+    loose |= {i for i in others if loose and loose.issuperset(state.nearest_keyframes(i, 1))}
+    held = np.array(sorted(set(state.poses).difference(loose)), np.int64)
+    # What holds before and behind a frame or two tells where they are about.
+    loose -= {i for a, b in pairwise(held.tolist()) if b - a <= MAX_GAP for i in range(a + 1, b)}
+    for i in sorted(loose):
+        state.remove_frame(i)
+        state.lost[i] = "what it shows does not determine its pose relative to the rest"
+    return sorted(loose), [[ids[k] for k in group] for group in apart]
 
 
 def undo_rolling_shutter(

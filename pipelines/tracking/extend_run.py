@@ -18,6 +18,7 @@ from ..run.extension import FINAL, save_parent
 from ..run.files import CALIBRATION, SPARSE
 from ..run.folder import RunFolder, load_records, load_source
 from ..run.manifest import Manifest, Source, write_manifest
+from ..sfm.adjust import FEATURE_SD
 from ..sfm.lens import Lens, calibrated_camera, make_lens, to_pycolmap
 from ..source.given import read_intrinsics
 from ..source.opening import VideoSource, open_source, require_different, source_digest, video_files
@@ -28,7 +29,7 @@ from ..system.wording import quoted
 from ..types import Features
 from .pictures import Pictures, load_shutter
 from .pnp import MIN_INLIERS, relocalise, solve_pose
-from .state import FEATURE_SD, Sightings, TrackState
+from .state import Sightings, TrackState
 
 _SAMPLES, _ENOUGH, _MIN_RECOGNISED = 24, 4, 2
 """Pictures of a video that are looked at; recognised ones that are enough to stop at, and that are needed."""

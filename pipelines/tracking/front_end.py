@@ -11,12 +11,13 @@ from ..depth.align import sample_proxy, scale_at_points
 from ..geometry import se3
 from ..geometry.camera import project, unproject
 from ..geometry.se3 import best_rotation
+from ..sfm.adjust import FEATURE_SD
 from ..sfm.flow import FLOW_SD, corners, follow
 from ..sfm.matching import match_descriptors
 from ..types import Array, Intrinsics
 from .pictures import Pictures
 from .pnp import MAX_GAP, MIN_INLIERS, POSE_ERROR, FramePose, predict_pose, relocalise, solve_pose
-from .state import FEATURE_SD, NO_SIGHTINGS, Sightings, TrackState
+from .state import NO_SIGHTINGS, Sightings, TrackState
 
 NEW_POINTS = 300
 """Points that a new keyframe should have."""

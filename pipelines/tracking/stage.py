@@ -1,25 +1,32 @@
 """Stage 3: a pose for every frame, metric where the proxy depth is, and the sparse points that hold them together."""
 
+from collections.abc import Collection
 from typing import Any
+
+import numpy as np
 
 from ...formats.errors import InputError
 from ..engine.stages import StageContext
 from ..geometry.camera import Rig, rig_of
 from ..run.files import BACKBONE, CALIBRATION, DEPTH_FIELDS, FIGURES, FRAMES, GIVEN_POSES, SPARSE, TRAJECTORY
+from ..sfm.adjust import FEATURE_SD
 from ..sfm.rolling import Shutter
 from ..system.memory import release_free_memory
 from ..system.progress import is_asked
 from ..system.values import load_value, save_value
 from ..system.wording import stretches
 from ..types import Frame
-from .adjust import Report, adjust_state, align_depths, without_dependent_depth
+from .adjust import Report, adjust_state, align_depths, drop_loose, without_dependent_depth
 from .front_end import FrontEnd, set_rotation_only_poses
 from .pictures import Pictures, load_shutter
+from .pnp import MAX_GAP
 from .segments import carry_given, join_segments, split_segments
-from .state import FEATURE_SD, TrackState, split_worlds, sync_rig_poses, to_sparse_model, to_trajectory
+from .state import TrackState, split_worlds, sync_rig_poses, to_sparse_model, to_trajectory
 
 SNAPSHOT_EVERY, SNAPSHOTS = 50, 20
 """Frames between two; of a long recording no more are taken in all, since each holds all that is known so far."""
+_LONG = 1.0
+"""Seconds without a position from which a stretch is said to be filmed badly."""
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -35,7 +42,8 @@ def run(context: StageContext) -> dict[str, Any]:
     require_poses(context, state, frames, 2 if context.run.find(GIVEN_POSES) is None else 1)
     report = adjust_state(state, intrinsics, pictures.proxy, metric, settings)
     release_free_memory()
-    carried = carry_given(context, state)
+    _, apart = drop_loose(state, report, intrinsics, context.config.frames.least_piece)
+    carried = carry_given(context, state, apart)
     require_poses(context, state, frames, 2)
     set_rotation_only_poses(state, pictures, context.config.run.seed)
     if state.turned:
@@ -59,7 +67,24 @@ def run(context: StageContext) -> dict[str, Any]:
     lost = set(state.lost).difference(*(p.poses for p in pieces))
     if lost:
         context.warn(f"{len(lost)} frames have no pose: {stretches(lost)}")
+    if len(state.rig) == 1:
+        warn_of_stretches(context, frames, lost.union(state.turned, *(p.turned for p in pieces)))
     return figures
+
+
+def warn_of_stretches(context: StageContext, frames: list[Frame], unplaced: Collection[int]) -> None:
+    """Warn of each stretch of a film, a second or longer, in which hardly a frame has a position."""
+    times = {f.id: f.timestamp for f in frames}
+    if len(frames) < 2 or float(np.median(np.diff(sorted(times.values())))) >= _LONG:  # photographs
+        return
+    ids = np.array(sorted(unplaced), np.int64)
+    for run in np.split(ids, np.flatnonzero(np.diff(ids) > MAX_GAP) + 1):
+        if len(run) and times[run[-1]] - times[run[0]] >= _LONG:
+            context.warn(
+                f"from {times[run[0]]:.1f} to {times[run[-1]]:.1f} s (frames {run[0]}-{run[-1]}) hardly a frame has a "
+                "position: the camera stood, only turned, or showed too little, such as a bare wall. Film that part "
+                "again while walking, with something textured in view"
+            )
 
 
 def require_poses(context: StageContext, state: TrackState, frames: list[Frame], least: int) -> None:

@@ -61,9 +61,6 @@ class Sightings:
         )
 
 
-FEATURE_SD = 0.35
-"""Pixels: how exactly a feature of structure from motion is known. Measured 0.2 to 0.3, at small scales and large ones;
-chosen on seven recordings: six paths are better than with 0.5 (by 0.1 to 24 %), one worse (by 0.5)."""
 _NEAR_KEYFRAMES = 8
 _SNAP_PX = 2.0
 """A feature within so many pixels of a frame's sighting is the same point."""

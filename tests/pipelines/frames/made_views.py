@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry import se3
@@ -71,13 +72,32 @@ def walk_round(camera: pycolmap.Camera, views: int = 20, blank: range = range(0)
         rng.uniform(-1.2, 1.2, _POINTS),
     )
     world = np.stack([far * np.sin(angle), height, far * np.cos(angle)], 1)
-    poses, features, seen = [], [], []
-    for n, turn in enumerate(np.linspace(0, 1.8, views)):
+    poses = []
+    for turn in np.linspace(0, 1.8, views):
         center = np.array([1.1 * np.sin(turn), 0.15 * np.sin(5 * turn), 0.8 * np.cos(turn)])
         cos, sin = np.cos(turn), np.sin(turn)
-        rotation = np.array([[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]])
-        poses.append(_pose(rotation, center))
-        local = (world - center) @ rotation.T
+        poses.append(_pose(np.array([[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]]), center))
+    return _seen_from(camera, poses, world, rng, blank)
+
+
+def walk_along_bare_wall(camera: pycolmap.Camera, views: int = 28) -> MadeViews:
+    """Views of a hand-held walk: the first show a strip of the floor below a bare wall, the others a room besides."""
+    rng = np.random.default_rng(0)
+    strip = np.column_stack([rng.uniform(-1.5, 5, 500), np.full(500, 0.72), rng.uniform(1.76, 1.82, 500)])
+    room = rng.uniform([2.6, -0.6, 1.4], [6, 0.6, 2.4], (_POINTS, 3))
+    poses = []
+    for n in range(views):
+        turn = Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix()
+        poses.append(_pose(turn, np.array([0.1 * n, 0, 0]) + rng.normal(0, 0.01, 3)))
+    return _seen_from(camera, poses, np.concatenate([strip, room]), rng)
+
+
+def _seen_from(
+    camera: pycolmap.Camera, poses: list[Array], world: Array, rng: np.random.Generator, blank: range = range(0)
+) -> MadeViews:
+    features, seen = [], []
+    for n, pose in enumerate(poses):
+        local = world @ pose[:3, :3].T + pose[:3, 3]
         ahead = np.flatnonzero((local[:, 2] > 0.5) & (np.abs(local[:, 0]) < 0.9 * local[:, 2]))
         pixels = np.asarray(camera.img_from_cam(local[ahead]))
         inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1) & (n not in blank)

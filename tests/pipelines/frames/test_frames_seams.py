@@ -199,3 +199,13 @@ def test_pairs_far_apart_that_contradict_are_no_fold(make_context: Callable[...,
     )
     assert len(context.warnings) == 1
     assert re.search("far apart contradict .* 69% of the matched pairs", context.warnings[0])
+
+
+def test_keyframes_that_were_left_out_are_named(make_context: Callable[..., StageContext], tmp_path: Path) -> None:
+    report = ModelReport(6, 9, 500, 0.3, 1.0, 1.0, (_seam(5),), (tuple(range(3, 9)),))
+    context = make_context(tmp_path)
+    structure = Structure(pycolmap.Reconstruction(), report, "global", 0.0, [], NO_WORDS, [], [], [], loose=[0, 1])
+    warn_of_structure(context, structure, list(range(0, 18, 2)))
+    assert len(context.warnings) == 2
+    assert "could not place 3 of 9 keyframes" in context.warnings[0]
+    assert "2 of them (frames 0, 2) show too little to determine their poses" in context.warnings[1]

@@ -1,5 +1,6 @@
 """Bundle adjustment: right derivatives, the same minimum as Ceres, and metres from proxy depths."""
 
+from collections.abc import Container
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +11,16 @@ from msgs_slam.pipelines.config import TrackingConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import align_points
+from msgs_slam.pipelines.sfm.adjust import FEATURE_SD
 from msgs_slam.pipelines.sfm.bundle import Bundle, Problem, adjust_bundle, adjust_pose, solve_blocks
-from msgs_slam.pipelines.tracking.adjust import adjust_state, consistent
+from msgs_slam.pipelines.sfm.given import posed_model
+from msgs_slam.pipelines.tracking import adjust
+from msgs_slam.pipelines.tracking.adjust import adjust_state, consistent, drop_loose
 from msgs_slam.pipelines.tracking.pnp import colmap_camera
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
+from tests.pipelines.frames.made_views import walk_along_bare_wall
+from tests.pipelines.frames.test_frames_given import CAMERA
 from tests.pipelines.tracking.conftest import KnownBundle
 
 
@@ -243,3 +249,55 @@ def test_equations_of_a_model_gone_wild_have_no_solution(count: int) -> None:
     assert solve_blocks(blocks, pairs, np.ones(6 * count)) is not None
     blocks[1, 0, 0] = np.nan
     assert solve_blocks(blocks, pairs, np.ones(6 * count)) is None
+
+
+def walk_state(views: int, keyframes: Container[int]) -> tuple[TrackState, Intrinsics]:
+    """Tracked along a bare wall, of which the first twelve frames show a strip of floor alone."""
+    made = walk_along_bare_wall(CAMERA, views)
+    state = TrackState(np.zeros((1 + max(int(s.max()) for s in made.seen), 3)))
+    model = posed_model(CAMERA, made.views().xy, made.cam_from_world, made.pairs(CAMERA), False, 0)
+    assert model is not None
+    for point in model.points3D.values():
+        of = {int(made.seen[e.image_id - 1][e.point2D_idx]) for e in point.track.elements}
+        state.points[sorted(of)] = point.xyz
+    known = np.abs(state.points).sum(1) > 0
+    for i in range(views):
+        seen = Sightings.of(made.seen[i], made.features[i].xy, FEATURE_SD)
+        pose = np.vstack([model.images[i + 1].cam_from_world().matrix(), [0, 0, 0, 1]])
+        state.add_frame(i, pose, seen.select(known[seen.point]), i in keyframes, 0)
+    return state, Intrinsics(640, 480, 520.0, 520.0, 320.0, 240.0)
+
+
+def test_frames_whose_poses_nothing_determines_are_lost() -> None:
+    every = range(34)
+    state, intrinsics = walk_state(34, every)
+    for i in (15, 20, 21, 33):  # too few of the points to hold, and of the last one nothing is behind
+        state.sightings[i] = state.sightings[i].select(np.arange(3))
+    report = adjust_state(state, intrinsics, lambda _: None, False, TrackingConfig())
+    before = dict(state.poses)
+    assert drop_loose(state, report, intrinsics, least=8) == ([*range(12), 33], [])
+    assert sorted(state.poses) == state.keyframes == list(range(12, 33))
+    assert sorted(state.lost) == [*range(12), 33]
+    assert all("does not determine its pose" in why for why in state.lost.values())
+    assert all(np.array_equal(state.poses[i], before[i]) for i in state.poses)
+
+
+def test_frames_that_follow_loose_keyframes_are_lost_with_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(adjust, "MAX_FRAMES", 10)
+    state, intrinsics = walk_state(28, [*range(0, 12, 2), *range(12, 28)])
+    report = adjust_state(state, intrinsics, lambda _: None, False, TrackingConfig())
+    assert report.frame_ids == [*range(0, 12, 2), *range(12, 28)]
+    loose, _ = drop_loose(state, report, intrinsics, least=8)
+    assert loose == list(range(11))  # the last one is followed from the room, too
+    assert sorted(state.poses) == list(range(11, 28))
+
+
+def test_exact_depths_determine_what_the_images_do_not() -> None:
+    """Without them a half that lies loosely beside the rest is told of, not lost."""
+    state, intrinsics = walk_state(20, range(20))
+    report = adjust_state(state, intrinsics, lambda _: None, False, TrackingConfig())
+    assert drop_loose(state, report, intrinsics, least=8) == ([], [list(range(12))])
+    z = report.bundle.points_in_cam()[:, 2]
+    tied = replace(report, bundle=replace(report.bundle, obs_depth=z, obs_depth_sd=np.full(len(z), 1e-6)))
+    assert drop_loose(state, tied, intrinsics, least=8) == ([], [])
+    assert sorted(state.poses) == list(range(20))

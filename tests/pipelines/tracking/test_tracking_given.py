@@ -1,21 +1,24 @@
 """Poses by another program carry a path over what the pictures do not show, and make metres."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.se3 import align_points
+from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import BACKBONE, FIGURES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
-from msgs_slam.pipelines.tracking.segments import drop_inconsistent_segments, pose_lost
+from msgs_slam.pipelines.tracking.segments import carry_given, drop_inconsistent_segments, pose_lost
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import GivenPoses
 from tests.matrices import write_matrices
@@ -141,3 +144,26 @@ def test_poses_of_another_recording_are_refused_before_anything(tmp_path: Path) 
     with pytest.raises(InputError, match="5 poses for 18 images"):
         reconstruct(tmp_path / "pictures", RunFolder(tmp_path / "run"), config, SilentProgress(), "tracking")
     assert read_rgb(tmp_path / "pictures" / "view_000.png").shape == (HEIGHT, WIDTH, 3)
+
+
+@pytest.mark.parametrize("is_given", [True, False])
+def test_a_group_that_lies_loosely_beside_the_rest_is_put_where_the_given_poses_say(is_given: bool) -> None:
+    """Its depths are right: only the way from the rest to it is bent."""
+    true, group = walked(40), list(range(10, 20))
+    state = stretch_at(range(40), true)
+    state.points = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
+    bent = Similarity(1.3, Rotation.from_rotvec([0.1, 0.2, 0]).as_matrix(), np.array([1.0, 0, 2]))
+    for i in group:
+        state.poses[i] = bent.apply_to_poses(true[i][None])[0]
+        state.sightings[i] = Sightings.of(np.arange(2), np.zeros((2, 2)), 1.0)  # the first is seen by all
+    given = GivenPoses(true if is_given else np.full_like(true, np.nan), True, "made up")
+    warned: list[str] = []
+    context: Any = SimpleNamespace(run=SimpleNamespace(find=lambda _: given), warn=warned.append)
+    figures = carry_given(context, state, [group])
+    assert figures["given_joined"] == is_given
+    assert ("disconnected components" if is_given else "10 frames (10-19) and the rest") in warned[0]
+    off = np.abs([state.poses[i] - true[i] for i in range(40)]).max((1, 2))
+    assert off[:10].max() == off[20:].max() == 0
+    assert (off[group].max() < 1e-9) == is_given
+    moved = bent.inverse().apply(np.array([[1.0, 0.0, 1.0]]))[0] if is_given else [1.0, 0.0, 1.0]
+    np.testing.assert_allclose(state.points, [[0, 0, 1], moved], atol=1e-9)

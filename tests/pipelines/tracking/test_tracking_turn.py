@@ -11,10 +11,12 @@ from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.run.files import TRAJECTORY
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.tracking.front_end import fit_rotation, turn_between
 from msgs_slam.pipelines.tracking.pictures import Pictures
 from msgs_slam.pipelines.tracking.stage import run as run_tracking
-from msgs_slam.pipelines.types import Intrinsics, Trajectory
+from msgs_slam.pipelines.tracking.stage import warn_of_stretches
+from msgs_slam.pipelines.types import Frame, Intrinsics, Trajectory
 from tests.pipelines.tracking.conftest import MadeRun
 from tests.world.clip import ClipOptions, WorldFrame, develop, make_world, render_view
 
@@ -112,3 +114,25 @@ def test_of_trajectories_of_retired_settings_every_pose_has_its_place() -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
     old = Trajectory(np.arange(3), np.arange(3.0), poses, np.array([True, False, False]), ("", "", "lost"))
     assert old.is_placed.tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("unplaced", "seconds", "wanted"),
+    [
+        ([*range(12)], 0.1, ["from 0.0 to 1.1 s (frames 0-11)"]),
+        ([0, 1, 2, 3, 6, 8, 9, 10], 0.1, ["from 0.0 to 1.0 s (frames 0-10)"]),
+        ([*range(10)], 0.1, []),
+        ([*range(5), *range(20, 25)], 0.1, []),
+        ([*range(12), *range(25, 38)], 0.1, ["frames 0-11", "frames 25-37"]),
+        ([*range(12)], 1.0, []),
+        ([], 0.1, []),
+    ],
+    ids=["long", "with gaps", "short", "two short", "two", "photographs", "none"],
+)
+def test_long_stretches_without_a_position_are_told_with_their_times(
+    unplaced: list[int], seconds: float, wanted: list[str], open_stage: Callable[..., StageContext], tmp_path: Path
+) -> None:
+    context = open_stage(RunFolder(tmp_path), "tracking")
+    warn_of_stretches(context, [Frame(i, f"{i}.png", seconds * i, i, 1.0) for i in range(40)], unplaced)
+    assert len(context.warnings) == len(wanted)
+    assert all(part in said for part, said in zip(wanted, context.warnings, strict=True))
