@@ -70,12 +70,12 @@ def test_a_class_map_of_another_vocabulary_is_warned_of(
     finished_run: FinishedRun, copied_run: Callable[[str], Path], tmp_path: Path
 ) -> None:
     run, mine = copied_run("run.msgs"), tmp_path / "mine.toml"
-    mine.write_text('[classes]\nwall = ["wall", "stucco"]\nairship = "wall"\n')
+    mine.write_text('[classes]\nwall = ["wall", "stucco"]\nxyzzy = "wall"\n')
     result = invoke("evaluate", run, "--truth", finished_run.truth, "--class-map", mine)
     assert result.exit_code == 0, result.stderr
-    assert "class map mine: there is no class 'airship' of the run, 'stucco' of the truth." in result.stderr
-    assert json.loads((run / "evaluation" / "evaluation.json").read_text())["labels"]["classes"] == ["wall"]
-    mine.write_text('[classes]\nairship = "wall"\n')
+    assert "class map mine: there is no class 'xyzzy' of the run, 'stucco' of the truth." in result.stderr
+    assert json.loads((run / "evaluation" / "evaluation.json").read_text())["labels"]["matching"] == "by mine"
+    mine.write_text('[classes]\nxyzzy = "wall"\n')
     refused = invoke("evaluate", run, "--truth", finished_run.truth, "--class-map", mine)
     assert refused.exit_code == 1
     assert "mine: joins none of the run's classes" in refused.stderr
