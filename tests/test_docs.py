@@ -99,7 +99,7 @@ def test_constants_that_a_benchmark_changes_stand_in_the_code() -> None:
     places = [place for table in tables for place in table.values()]
     assert len(places) > 20
     for file, line, number in places:
-        assert line in (ROOT / "pipelines" / "depth" / "stereo" / file).read_text(encoding="utf-8"), line
+        assert line in (ROOT / "pipelines" / "depth" / file).read_text(encoding="utf-8"), line
         assert number in line
 
 

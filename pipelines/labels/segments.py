@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError
-from ..depth.stereo.fill import spread_in_place
+from ..depth.completion.fill import spread_in_place
 from ..geometry.camera import resample_nearest, unproject_depth
 from ..geometry.room_layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
 from ..geometry.voxels import (

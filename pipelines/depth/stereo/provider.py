@@ -17,23 +17,16 @@ from numpy.typing import NDArray
 
 from ....formats.errors import InputError
 from ...geometry.sparse_model import SparseModel
-from ...geometry.voxels import to_lab
 from ...providers import DepthEstimate, Sequence, resize_area
 from ...system.parallel import LruCache, map_lookahead
 from ...system.progress import Progress
 from ...system.values import load_value, save_value
 from ...types import Frame, Intrinsics
+from ..completion.candidates import LENT_CONFIDENCE, Half, invert
+from ..completion.evidence import ASKED, LENDERS, Case, ask_again, gather_case
+from ..completion.fill import SURE, evidence_of, smooth_confidence
+from ..completion.keyframe import HALF, TWICE, as_completed, complete, halved, trusted
 from .consistency import fuse_depths
-from .fill import (
-    SURE,
-    agreed_depth,
-    carry_depth,
-    evidence_of,
-    fill_unsure,
-    propagate_depth,
-    restore_supported_matches,
-    smooth_confidence,
-)
 from .matching import StereoImages, match_planes
 from .neighbours import choose_neighbours, depth_range
 from .sweep import warps_to
@@ -42,13 +35,14 @@ from .volume import Bands
 from .window import surface_contrast
 
 _CACHED_FRAMES = 48
-_VIEWS, _FUSE_VIEWS, _LENDERS = 12, 8, 16
-"""Keyframes that one is matched with, those whose depths are compared, and those that lend theirs. What lies beside a
-near thing is hidden from half of the views."""
+_VIEWS, _FUSE_VIEWS = 12, 8
+"""Keyframes that one is matched with, and those whose depths are compared. What lies beside a near thing is hidden from
+half of the views."""
 _RANGE_VIEWS = 6
 """Their points say how near and far to look."""
-_CACHED_LENDERS = _LENDERS + 4
-"""Whose colours are kept. With no more of the fused depths each would be fused four to five times."""
+_CACHED_LENDERS = LENDERS + 4
+"""What is kept of them at half the size. With no more of the fused depths each would be fused four to five times."""
+_CACHED_CASES = 6
 _BEST_ANGLE = 8.0
 """Degrees between the views of a pair."""
 _STOP = 0.02
@@ -93,9 +87,9 @@ class MultiviewDepth:
         self._fused = LruCache(self._fuse, _CACHED_FRAMES)
         self._small = LruCache(self._read_small, _CACHED_FRAMES)
         self._contrast = LruCache(self._measure_contrast, _CACHED_LENDERS)
-        self._lab: LruCache[int, NDArray[np.float32]] = LruCache(
-            lambda index: to_lab(self._small(index)), _CACHED_LENDERS
-        )
+        self._half = LruCache(self._halve, _CACHED_LENDERS)
+        self.first_case = LruCache(self._gather, _CACHED_CASES)
+        self._completed = LruCache(self._complete_first, _CACHED_LENDERS)
         self._nearest = LruCache(self._choose_nearest, _CACHED_FRAMES)
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
@@ -146,11 +140,44 @@ class MultiviewDepth:
         if frame.id not in self._index:
             empty = np.zeros((target.height, target.width), np.float32)
             return DepthEstimate(empty, empty)
-        index = self._index[frame.id]
-        borrowed, sure = self._borrow(index)
-        filled, confidence = fill_unsure(borrowed, sure, self._small(index))
-        depth = self._restore_supported(index, filled, sure < SURE)
-        return upsample_depth(depth, confidence, self._sequence.image(frame))
+        return upsample_depth(*self._complete(self._index[frame.id]), self._sequence.image(frame))
+
+    def _complete(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Depth and confidence of one keyframe at the size that is matched, completed where it is not sure itself."""
+        (depth, confidence), case = self._fused(index), self.case(index)
+        if case is None:
+            return depth, np.minimum(confidence, SURE)
+        small, error = complete(case, self._device)
+        found, sure = upsample_depth(small, trusted(case, error), self._small(index)), confidence >= SURE
+        trust = np.where(sure, confidence, np.minimum(found.confidence, LENT_CONFIDENCE))
+        return np.where(sure, depth, found.depth), trust
+
+    def case(self, index: int) -> Case | None:
+        """Gather what the completion of a keyframe's depth rests on, by its place in the backbone: other keyframes are
+        asked again, completed. None with hardly any sure pixel."""
+        first = self.first_case(index)
+        if first is None:
+            return None
+        asked = self._present(self._neighbours(index, ASKED))
+        return ask_again(first, [self._completed(j) for j in asked.tolist()], self._half_warps(index, asked))
+
+    def _gather(self, index: int) -> Case | None:
+        """Do the same from what keyframes know by themselves."""
+        lenders = self._present(self._neighbours(index, LENDERS))
+        lent = [self._half_warps(j, np.array([index]))[0] for j in lenders.tolist()]
+        halves = [self._half(j) for j in lenders.tolist()]
+        return gather_case(self._half(index), halves, lent, self._half_warps(index, lenders[:ASKED]))
+
+    def _complete_first(self, index: int) -> Half:
+        case = self.first_case(index)
+        return self._half(index) if case is None else as_completed(case, self._device)
+
+    def _half_warps(self, index: int, others: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+        return [HALF @ warp @ TWICE for warp in self._warps(index, others)]
+
+    def _halve(self, index: int) -> Half:
+        size = -(-self.camera.width // 2), -(-self.camera.height // 2)
+        return halved(*self._fused(index), resize_area(self._small(index), *size), self._contrast(index))
 
     def evidence(self, frame: Frame) -> DepthEstimate:
         """Depths of a keyframe at the size that is matched, and how well other views bear them out; nothing is filled
@@ -167,31 +194,6 @@ class MultiviewDepth:
         others = np.stack([depth_of(self._frame[int(i)]) for i in self._model.frame_ids[companions]])
         warps, back = self._warps(index, companions), self._rows_back(index, companions)
         return self._compare(own, others, warps, back, 2 * _TOLERANCE)[0]
-
-    def _restore_supported(
-        self, index: int, filled: NDArray[np.float32], unsure: NDArray[np.bool_]
-    ) -> NDArray[np.float32]:
-        """The keyframe's own matches where the depths of others bear them out better than what was filled in."""
-        companions = self._present(self._neighbours(index, _VIEWS))
-        if len(companions) == 0:
-            return filled
-        others = np.stack([self._fused(j)[0] for j in companions.tolist()])
-        warps, back = self._warps(index, companions), self._rows_back(index, companions)
-
-        def support(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-            _, support, conflict = self._compare(np.where(unsure, depth, 0), others, warps, back, 2 * _TOLERANCE)
-            return np.asarray(support - conflict)
-
-        return restore_supported_matches(filled, self._fused(index)[0], support, self._contrast(index))
-
-    def _borrow(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Depth and confidence of one keyframe, with sure depths of others where its own is unsure."""
-        own, lab = self._fused(index), self._lab(index)
-        carried = []
-        for j in self._present(self._neighbours(index, _LENDERS)).tolist():
-            warp = self._warps(j, np.array([index]))[0]
-            carried.append(carry_depth(*self._fused(j), self._lab(j), warp, lab))
-        return propagate_depth(*own, *agreed_depth(carried, own[1] < SURE)) if carried else own
 
     def _fuse(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth of one keyframe and those of its neighbours that agree, and its confidence."""
@@ -244,7 +246,7 @@ class MultiviewDepth:
 
     def _choose_nearest(self, index: int) -> NDArray[np.int64]:
         camera = self._sequence.calibration.intrinsics
-        return choose_neighbours(self._model, camera, index, _LENDERS, _BEST_ANGLE)
+        return choose_neighbours(self._model, camera, index, LENDERS, _BEST_ANGLE)
 
     def _warps(self, index: int, others: NDArray[np.int64]) -> NDArray[np.float64]:
         matrix, poses = self.camera.matrix, self._model.cam_from_world
@@ -283,13 +285,6 @@ def at_stops(inverse: NDArray[np.float32], planes: NDArray[np.float64]) -> NDArr
     than the first, and all views agree on it."""
     place = (inverse - planes[0]) / (planes[-1] - planes[0])
     return np.asarray((place < _STOP) | (place > 1 - _STOP))
-
-
-def invert(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """1 / values, and 0 stays 0: depth from inverse depth and back."""
-    out = np.zeros_like(values)
-    np.divide(1, values, out=out, where=values > 0)
-    return out
 
 
 def agreement(support: NDArray[np.float32], conflict: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -4,18 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from msgs_slam.pipelines.depth.completion.fill import SURE, evidence_of, smooth_confidence
 from msgs_slam.pipelines.depth.stereo import matching
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths
-from msgs_slam.pipelines.depth.stereo.fill import (
-    SURE,
-    agreed_depth,
-    carry_depth,
-    evidence_of,
-    fill_unsure,
-    propagate_depth,
-    restore_supported_matches,
-    smooth_confidence,
-)
 from msgs_slam.pipelines.depth.stereo.matching import (
     CLEAR,
     MARGIN,
@@ -301,75 +292,6 @@ def test_agreeing_views_support_and_better_the_depth_and_liars_do_not() -> None:
     assert fused.max() == support.max() == 0
 
 
-def test_a_blank_wall_is_filled_with_the_plane_of_its_border() -> None:
-    truth = 1 / (0.5 - 0.002 * np.arange(WIDTH)[None] + 0.001 * np.arange(HEIGHT)[:, None])
-    image = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
-    confidence = np.full((HEIGHT, WIDTH), 0.9, np.float32)
-    blank = np.zeros((HEIGHT, WIDTH), bool)
-    blank[5:-5, 6:-6] = True
-    confidence[blank] = 0.05
-    seen = np.where(blank, np.random.default_rng(2).uniform(1, 9, truth.shape), truth).astype(np.float32)
-    filled, trust = fill_unsure(seen, confidence, image)
-    np.testing.assert_array_equal(filled[~blank], seen[~blank])
-    assert np.abs(filled / truth - 1)[blank].max() < 0.02
-    assert 0 < trust[blank].min() <= trust[blank].max() < SURE
-
-
-def test_each_of_two_blank_surfaces_takes_its_own_plane() -> None:
-    left = np.broadcast_to(np.arange(WIDTH) < 30, (HEIGHT, WIDTH))
-    slope = 0.002 * np.arange(WIDTH)[None] + 0 * np.arange(HEIGHT)[:, None]
-    truth = np.where(left, 1 / (0.3 + slope), 1 / (0.9 - slope))
-    image = np.where(left, 60, 180).astype(np.uint8)[..., None].repeat(3, -1)
-    sure = np.ones((HEIGHT, WIDTH), bool)
-    sure[8:-8] = False
-    filled, _ = fill_unsure(truth.astype(np.float32), np.where(sure, 0.9, 0).astype(np.float32), image)
-    assert np.abs(filled / truth - 1).max() < 0.03
-
-
-SURE_PLACES = {
-    "top rows": np.s_[:9],
-    "a corner": np.s_[:8, :8],
-    "the other corner": np.s_[-8:, -8:],
-    "left columns": np.s_[:, :6],
-    "one pixel": np.s_[3:4, 5:6],
-    "none": np.s_[:0],
-}
-
-
-@pytest.mark.parametrize("shape", [(96, 54), (54, 96), (72, 72), (320, 20), (20, 320)])
-@pytest.mark.parametrize("place", SURE_PLACES)
-def test_filled_depths_stay_near_the_sure_ones_in_pictures_of_any_shape(shape: tuple[int, int], place: str) -> None:
-    rng = np.random.default_rng(5)
-    image = rng.integers(0, 255, (*shape, 3)).astype(np.uint8)  # no two colours are alike: votes hardly spread
-    depth, confidence = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    depth[SURE_PLACES[place]] = rng.uniform(2, 3, depth[SURE_PLACES[place]].shape)
-    confidence[SURE_PLACES[place]] = 0.9
-    filled, trust = fill_unsure(depth, confidence, image)
-    assert np.isfinite(filled).all()
-    assert trust.min() >= 0
-    assert trust.max() <= 1
-    sure = confidence > 0
-    np.testing.assert_array_equal(filled[sure], depth[sure])
-    if sure.sum() >= 40:
-        assert 0.5 * 2 < filled.min() <= filled.max() < 2 * 3
-    else:
-        assert filled[~sure].max(initial=0) == 0
-    judged = smooth_confidence(confidence, image)
-    assert 0 <= judged.min() <= judged.max() <= 1
-
-
-def test_a_picture_held_upright_is_filled_like_one_held_across() -> None:
-    """A plane of which the first third is sure."""
-    rows, columns = np.mgrid[:54, :96]
-    truth = (1 / (0.6 - 0.003 * columns + 0.001 * rows)).astype(np.float32)
-    confidence = np.where(columns < 32, 0.9, 0).astype(np.float32)
-    image = np.full((54, 96, 3), 120, np.uint8)
-    across, trust = fill_unsure(truth, confidence, image)
-    upright, trust_upright = fill_unsure(truth.T.copy(), confidence.T.copy(), image.swapaxes(0, 1).copy())
-    np.testing.assert_allclose(upright.T, across, rtol=0.02)
-    np.testing.assert_allclose(trust_upright.T, trust, atol=0.01)
-
-
 def test_a_chance_match_in_a_blank_wall_is_not_sure_for_it_stands_alone() -> None:
     image = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
     image[:, 30:] = np.random.default_rng(3).integers(0, 40, (HEIGHT, 30, 3))
@@ -399,64 +321,6 @@ def test_agreement_on_a_blank_surface_is_little_evidence_also_beside_its_border(
     assert np.quantile(evidence[:, 27:30], 0.9) < 0.5  # the windows of these columns reach into the texture
     assert evidence[:, 30:].mean() > 0.9
     assert evidence[:, 30:].max() < 1
-
-
-def test_a_match_that_other_views_bear_out_is_preferred_to_a_plane_in_front_of_it() -> None:
-    truth = view_of_plane(np.eye(4), 0.3)[1].astype(np.float32)
-    others = np.stack([view_of_plane(c, 0.3)[1] for c in CAMERAS]).astype(np.float32)
-    back = np.array([warps_to(MATRIX, c, [MATRIX], [np.eye(4)])[0][2] for c in CAMERAS])
-    warps = warps_to(MATRIX, np.eye(4), [MATRIX] * 4, CAMERAS)
-
-    def borne_out(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        _, support, conflict = fuse_depths(depth, others, warps, back, 0.02, Bands(1))
-        return np.asarray(support - conflict)
-
-    in_front, inner = (0.6 * truth).astype(np.float32), (slice(8, -8), slice(10, -10))
-    clear, blank = np.full(truth.shape, 1e-3, np.float32), np.full(truth.shape, 1e-5, np.float32)
-    np.testing.assert_array_equal(restore_supported_matches(in_front, truth, borne_out, clear)[inner], truth[inner])
-    np.testing.assert_array_equal(restore_supported_matches(truth, in_front, borne_out, clear)[inner], truth[inner])
-    np.testing.assert_array_equal(restore_supported_matches(in_front, truth, borne_out, blank), in_front)
-    np.testing.assert_array_equal(restore_supported_matches(in_front, np.zeros_like(truth), borne_out, clear), in_front)
-
-
-def lend(truth: NDArray, color: float, confidence: float = 0.9) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The plane's depths of a camera aside, whose picture has one lightness, carried into the middle camera."""
-    warp = warps_to(MATRIX, CAMERAS[0], [MATRIX], [np.eye(4)])[0]
-    seen = view_of_plane(CAMERAS[0], 0.3)[1].astype(np.float32)
-    lab, target = np.zeros((HEIGHT, WIDTH, 3), np.float32), np.zeros((HEIGHT, WIDTH, 3), np.float32)
-    lab[..., 1] = color
-    return carry_depth(seen, np.full(seen.shape, confidence, np.float32), lab, warp, target)
-
-
-def test_unsure_depths_are_taken_from_views_that_show_the_same_colour() -> None:
-    truth = view_of_plane(np.eye(4), 0.3)[1]
-    own, unsure = (truth * 3).astype(np.float32), np.full(truth.shape, 0.1, np.float32)
-    everywhere = np.ones(truth.shape, np.bool_)
-    inner = (slice(4, -4), slice(10, -10))
-    for carried in ([lend(truth, 0.5), lend(truth, 0.0)], [lend(truth, 0.0)], [lend(truth, 4.0)] * 2):
-        depth, confidence = propagate_depth(own, unsure, *agreed_depth(carried, everywhere))
-        assert np.abs(depth / truth - 1)[inner].max() < 0.02
-        assert confidence[inner].min() > SURE
-    for carried in ([lend(truth, 12.0)] * 4, [lend(truth, 0.0, 0.2)] * 4, [lend(truth, 4.0)]):
-        depth, confidence = propagate_depth(own, unsure, *agreed_depth(carried, everywhere))
-        np.testing.assert_array_equal(depth, own)
-        np.testing.assert_array_equal(confidence, unsure)
-    sure = np.full(truth.shape, SURE, np.float32)
-    depth, _ = propagate_depth(own, sure, *agreed_depth([lend(truth, 0.0)] * 3, everywhere))
-    assert not agreed_depth([lend(truth, 0.0)] * 3, ~everywhere)[1].any()
-    np.testing.assert_array_equal(depth, own)
-
-
-def test_of_two_carried_depths_the_nearer_hides_the_other() -> None:
-    depth = np.full((HEIGHT, WIDTH), 3.0, np.float32)
-    depth[:, :20] = 1.5
-    lab = np.zeros((HEIGHT, WIDTH, 3), np.float32)
-    warp = warps_to(MATRIX, shifted(-0.3), [MATRIX], [np.eye(4)])[0]
-    carried, likeness = carry_depth(depth, np.ones_like(depth), lab, warp, lab)
-    # Seen from 0.3 to the right, the near board moves right by 10 pixels and the wall by 5.
-    np.testing.assert_allclose(carried[:, 25:29], 1.5, rtol=1e-5)
-    np.testing.assert_allclose(carried[:, 31:50], 3.0, rtol=1e-5)
-    assert set(np.unique(likeness)) <= {0.0, 1.0}
 
 
 def test_enlarged_depth_has_its_edge_where_the_picture_has_it() -> None:

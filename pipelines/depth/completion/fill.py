@@ -1,12 +1,10 @@
-"""Depth where the views of a keyframe do not agree: borrowed from other keyframes, else filled in from around.
+"""Support for a depth beside a keyframe's own match: other keyframes' sure depths, and planes through those around.
 
 What a view shows at its rim, or too blank from where it stands, others may see better: their sure depths are borrowed
 where both show the same colour. Walls and cupboards without texture cannot be matched at all, but their borders can,
 and they are mostly flat: at each pixel the plane through the sure depths that lie along like colours. A chance match in
 the middle of them stands alone, so that how sure a depth is depends on how sure those around it are.
 """
-
-from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -16,17 +14,11 @@ from ...system.jit import kernel
 
 _FAINT, _POWER = 5e-5, 0.25
 """Variance (intensities 0..1; two grey levels) and power by which agreement on a blank surface counts less."""
-_CLEAR = 2e-4
-"""Variance from which a match can be preferred to a guess."""
 _COLOR_SD = 3.0
 _LIGHT = 0.5
 """A difference in lightness counts so much: exposure and shading change it from view to view."""
 _AGREE = 0.02
 _IN_FRONT = 0.98
-_MIN_MASS = 0.5
-"""Likeness of colour that the agreeing views must have together; a view of the same colour counts 1. By the depth of
-six rooms' proxies 1.0 is 1 to 4 % worse on three and 0.2 % better on three; of three, 0.25 is 1 % worse on two."""
-_BORROWED_CONFIDENCE = 0.35
 
 Array = NDArray[np.float64]
 
@@ -36,7 +28,6 @@ _COMPANY_REACH, _COMPANY_SD = 3 / 80, 30.0
 """As a part of the longer side; colours."""
 _COMPANY_POWER = 0.9
 """Brings the calibration: from confidence 0.42 (reliability 0.5) on, at most 3 % are off by more than 5 %."""
-_EVIDENCE_POWER = 2.5
 _REACHES = ((1 / 16, 30.0, 1.0), (1 / 4, 60.0, 0.1))
 """How far a depth speaks along like colours (as a part of the longer side), the colour step that stops it, and how much
 it then counts."""
@@ -46,9 +37,6 @@ a fourth of it on, the blur (OpenCV cuts it off at four standard deviations) rea
 _RIDGE = 3e-4
 """Variance of place, in longer sides squared, below which the evidence does not fix a slope: then it is kept small."""
 _MIN_SLOPE, _MAX_SLOPE = 0.5, 1.6
-_MIN_PIXELS = 40
-_FLAT_CONFIDENCE, _GUESS_CONFIDENCE = 0.2, 0.03
-_KNOWN_MASS = 1e-3
 _FACTORS = 9
 """Sums that fix a plane, see `_write_votes`."""
 
@@ -65,39 +53,7 @@ def evidence_of(contrast: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.power(contrast / (contrast + np.float32(_FAINT)), np.float32(_POWER))
 
 
-def restore_supported_matches(
-    filled: NDArray[np.float32],
-    matched: NDArray[np.float32],
-    support: Callable[[NDArray[np.float32]], NDArray[np.float32]],
-    contrast: NDArray[np.float32],
-) -> NDArray[np.float32]:
-    """(h, w) filled depths, and matched ones (0 where none) where `support` (agreeing less contradicting views)
-    is larger for them and there was something to match; it is asked of no other pixels, which are 0.
-
-    What lies beside a near thing is seen by too few views to be sure, and a plane through what is sure would draw the
-    near thing over it.
-    """
-    asked = (matched > 0) & (contrast > _CLEAR)
-    better = support(np.where(asked, matched, 0)) > support(np.where(asked, filled, 0))
-    return np.where(asked & better, matched, filled)
-
-
-def fill_unsure(
-    depth: NDArray[np.float32], confidence: NDArray[np.float32], image: NDArray[np.uint8]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(h, w) depth and confidence with every unsure depth replaced by a guess of low confidence; image (h, w, 3)."""
-    sure = (confidence >= SURE) & (depth > 0)
-    if sure.sum() < _MIN_PIXELS:
-        return depth, np.minimum(confidence, SURE)
-    weight = np.where(depth > 0, confidence, 0).astype(np.float64) ** _EVIDENCE_POWER
-    inverse = np.divide(1.0, depth, out=np.zeros(depth.shape), where=depth > 0)
-    guess, mass = _local_planes(inverse, weight, image)
-    filled = np.where(sure, depth, 1 / guess)
-    trust = np.maximum(_FLAT_CONFIDENCE * mass / (mass + _KNOWN_MASS), _GUESS_CONFIDENCE)
-    return filled.astype(np.float32), np.where(sure, confidence, trust).astype(np.float32)
-
-
-def _local_planes(inverse: Array, weight: Array, image: NDArray[np.uint8]) -> tuple[Array, Array]:
+def local_planes(inverse: Array, weight: Array, image: NDArray[np.uint8]) -> tuple[Array, Array]:
     """(h, w) inverse depth of the plane through the evidence around each pixel (in a picture, the inverse depth of a
     plane is linear), and the evidence's mass: weighted least squares whose weights fade along like colours."""
     side = max(inverse.shape)
@@ -157,17 +113,6 @@ def _spread_anywhere(votes: NDArray[np.float32]) -> NDArray[np.float32]:
     small = cv2.resize(votes, size, interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (0, 0), sd, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
-
-
-def propagate_depth(
-    depth: NDArray[np.float32],
-    confidence: NDArray[np.float32],
-    lent: NDArray[np.float32],
-    mass: NDArray[np.float32],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(h, w) depth and confidence with the unsure ones taken from what the others agree on, as `agreed_depth` says."""
-    taken = (confidence < SURE) & (mass > _MIN_MASS)
-    return np.where(taken, lent, depth), np.where(taken, np.float32(_BORROWED_CONFIDENCE), confidence)
 
 
 def agreed_depth(
