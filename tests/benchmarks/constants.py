@@ -33,37 +33,44 @@ from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
 
-STEREO = Path("pipelines/depth/stereo")
+DEPTH = Path("pipelines/depth")
 AS_IT_IS = "as it is"
 AFTER = {
-    "agreeing depths": ("provider.py", "_TOLERANCE = 0.01", "0.01"),
-    "sure from": ("fill.py", "SURE = 0.3", "0.3"),
-    "reach of company": ("fill.py", "_COMPANY_REACH, _COMPANY_SD = 3 / 80, 30.0", "3"),
-    "colours of company": ("fill.py", "_COMPANY_REACH, _COMPANY_SD = 3 / 80, 30.0", "30.0"),
-    "power of evidence": ("fill.py", "_EVIDENCE_POWER = 2.5", "2.5"),
-    "colours of near evidence": ("fill.py", "_REACHES = ((1 / 16, 30.0, 1.0), (1 / 4, 60.0, 0.1))", "30.0"),
-    "colours of far evidence": ("fill.py", "_REACHES = ((1 / 16, 30.0, 1.0), (1 / 4, 60.0, 0.1))", "60.0"),
-    "weight of far evidence": ("fill.py", "_REACHES = ((1 / 16, 30.0, 1.0), (1 / 4, 60.0, 0.1))", "0.1"),
-    "ridge of planes": ("fill.py", "_RIDGE = 3e-4", "3e-4"),
-    "faint variance": ("fill.py", "_FAINT, _POWER = 5e-5, 0.25", "5e-5"),
-    "power of contrast": ("fill.py", "_FAINT, _POWER = 5e-5, 0.25", "0.25"),
-    "clear variance": ("fill.py", "_CLEAR = 2e-4", "2e-4"),
-    "colours of borrowing": ("fill.py", "_COLOR_SD = 3.0", "3.0"),
-    "borrowed depths agree": ("fill.py", "_AGREE = 0.02", "0.02"),
-    "likeness to borrow": ("fill.py", "_MIN_MASS = 0.5", "0.5"),
+    "agreeing depths": ("stereo/provider.py", "_TOLERANCE = 0.01", "0.01"),
+    "sure from": ("completion/fill.py", "SURE = 0.3", "0.3"),
+    "reach of company": ("completion/fill.py", "_COMPANY_REACH, _COMPANY_SD = 3 / 80, 30.0", "3"),
+    "colours of company": ("completion/fill.py", "_COMPANY_REACH, _COMPANY_SD = 3 / 80, 30.0", "30.0"),
+    "colours of near evidence": (
+        "completion/fill.py",
+        "_REACHES = ((1 / 16, 30.0, 1.0), (1 / 4, 60.0, 0.1))",
+        "30.0",
+    ),
+    "colours of far evidence": (
+        "completion/fill.py",
+        "_REACHES = ((1 / 16, 30.0, 1.0), (1 / 4, 60.0, 0.1))",
+        "60.0",
+    ),
+    "weight of far evidence": ("completion/fill.py", "_REACHES = ((1 / 16, 30.0, 1.0), (1 / 4, 60.0, 0.1))", "0.1"),
+    "ridge of planes": ("completion/fill.py", "_RIDGE = 3e-4", "3e-4"),
+    "faint variance": ("completion/fill.py", "_FAINT, _POWER = 5e-5, 0.25", "5e-5"),
+    "power of contrast": ("completion/fill.py", "_FAINT, _POWER = 5e-5, 0.25", "0.25"),
+    "power of evidence": ("completion/candidates.py", "_EVIDENCE_POWER = 2.5", "2.5"),
+    "likeness to borrow": ("completion/evidence.py", "_LEAST = 0.5", "0.5"),
+    "colours of borrowing": ("completion/fill.py", "_COLOR_SD = 3.0", "3.0"),
+    "borrowed depths agree": ("completion/fill.py", "_AGREE = 0.02", "0.02"),
 }
 """Name → file, its line, and the number in the line that is changed."""
 WITHIN = {
-    "angle of a pair": ("provider.py", "_BEST_ANGLE = 8.0", "8.0"),
-    "ends of the range": ("provider.py", "_STOP = 0.02", "0.02"),
-    "likeness in a window": ("window.py", "LIKENESS = 0.04", "0.04"),
-    "floor of variance": ("window.py", "VARIANCE_FLOOR = 2e-5", "2e-5"),
-    "small step": ("matching.py", "SMALL_STEP, JUMP, EDGE = 0.1, 1.2, 0.05", "0.1"),
-    "jump": ("matching.py", "SMALL_STEP, JUMP, EDGE = 0.1, 1.2, 0.05", "1.2"),
-    "edge of a jump": ("matching.py", "SMALL_STEP, JUMP, EDGE = 0.1, 1.2, 0.05", "0.05"),
-    "stiffness": ("matching.py", "STIFFNESS = 0.01", "0.01"),
-    "near margin": ("neighbours.py", "_NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5", "0.45"),
-    "far margin": ("neighbours.py", "_NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5", "1.5"),
+    "angle of a pair": ("stereo/provider.py", "_BEST_ANGLE = 8.0", "8.0"),
+    "ends of the range": ("stereo/provider.py", "_STOP = 0.02", "0.02"),
+    "likeness in a window": ("stereo/window.py", "LIKENESS = 0.04", "0.04"),
+    "floor of variance": ("stereo/window.py", "VARIANCE_FLOOR = 2e-5", "2e-5"),
+    "small step": ("stereo/matching.py", "SMALL_STEP, JUMP, EDGE = 0.1, 1.2, 0.05", "0.1"),
+    "jump": ("stereo/matching.py", "SMALL_STEP, JUMP, EDGE = 0.1, 1.2, 0.05", "1.2"),
+    "edge of a jump": ("stereo/matching.py", "SMALL_STEP, JUMP, EDGE = 0.1, 1.2, 0.05", "0.05"),
+    "stiffness": ("stereo/matching.py", "STIFFNESS = 0.01", "0.01"),
+    "near margin": ("stereo/neighbours.py", "_NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5", "0.45"),
+    "far margin": ("stereo/neighbours.py", "_NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5", "1.5"),
 }
 
 
@@ -79,7 +86,7 @@ def variants(only: str, factors: list[float]) -> Iterator[tuple[str, tuple[str, 
 def change(tree: Path, place: tuple[str, str, str], factor: float) -> None:
     """The line of the copied source with the number times the factor. ValueError if it is not as written here."""
     file, line, number = place
-    path = tree / "msgs_slam" / STEREO / file
+    path = tree / "msgs_slam" / DEPTH / file
     text = path.read_text()
     found = re.findall(pattern := rf"(?<![\d.]){re.escape(number)}(?![\d.])", line)
     if text.count(f"{line}\n") != 1 or len(found) != 1:

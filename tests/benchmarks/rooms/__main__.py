@@ -5,8 +5,7 @@ to learn from.
     python -m tests.benchmarks.rooms measure DIR NAME --set judge           the product's depth of them, kept as NAME
     python -m tests.benchmarks.rooms table DIR OLD [NEW] --set judge        one against the other
     python -m tests.benchmarks.rooms video DIR --set judge --rooms 4        videos with their truth, DIR/video/SEED
-    python -m tests.benchmarks.rooms learn DIR                              a learned choice, from the set `learn`
-    python -m tests.benchmarks.rooms measure DIR NAME --choice              the depth that it chooses
+    python -m tests.benchmarks.rooms learn DIR --seconds 560 --workers 15   the network that completes depth, on a card
     python -m tests.benchmarks.rooms measure DIR NAME --network 6           fused with a network that is off by 6 %
 
 A default about depth is chosen on `choose` and reported on `judge`. A room is a seed: walls, textures, light, furniture
@@ -29,23 +28,23 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.tensors import save_arrays
+from msgs_slam.pipelines.depth.completion.keyframe import complete
 from msgs_slam.pipelines.depth.fused import FusedDepth
 from msgs_slam.pipelines.depth.scale import measure_scale
+from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
+from msgs_slam.pipelines.geometry.camera import resample_nearest
 from msgs_slam.pipelines.providers import DepthEstimate, DepthProvider, Sequence
 
-from .choice.completion import Completion
-from .choice.model import load_model
 from .clip import Clip, make_clip
 from .furniture import furniture
+from .learning import learn
 from .network import NetworkLike
 from .room import KINDS, kind_of
 from .video import make_video
 
-SETS = {"choose": (1000, 40), "judge": (2000, 40), "learn": (10_000, 300)}
+SETS = {"choose": (1000, 40), "judge": (2000, 40), "learn": (30_000, 2000)}
 """First seed and number of rooms; seeds without a place to walk are passed over."""
 SURE, OFF = 0.3, 0.05
-MODEL = "choice.npz"
 
 
 def seeds_of(folder: Path, name: str, make: bool = False, package: Path | None = None, most: int = 0) -> list[int]:
@@ -63,8 +62,7 @@ def seeds_of(folder: Path, name: str, make: bool = False, package: Path | None =
             if clip is None:
                 continue
             clip.save(path)
-            if name != "learn":
-                clip.stereo(folder / "stereo" / str(seed))
+            clip.stereo(folder / "stereo" / str(seed))
             print(f"{seed} {clip.kind}: {time.process_time() - start:.1f} CPU seconds", flush=True)
         if path.exists():
             found.append(seed)
@@ -85,21 +83,9 @@ def make_videos(folder: Path, name: str, package: Path | None, most: int) -> Non
                 break
 
 
-def learn_choice(folder: Path, most: int) -> None:
-    """Leave the weights of the choice in the folder; tested on the rooms to choose on."""
-    from .choice.learn import gather, learn
-
-    chosen = seeds_of(folder, "choose")
-    learned = seeds_of(folder, "learn", most=most)
-    parts = gather(folder, learned, worse=True), gather(folder, chosen, worse=False)
-    evidence, errors, rooms = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    print(f"{len(np.unique(rooms))} rooms, {len(rooms)} pixels", flush=True)
-    save_arrays(folder / MODEL, learn(evidence, errors, rooms, np.isin(rooms, chosen)).weights())
-
-
-def measure(folder: Path, seeds: list[int], name: str, choice: bool, network: float, alone: bool) -> None:
-    """Keep depth (0: none) and confidence of every keyframe by the product as it is, by the learned choice, or with a
-    network (0: without) that is off by `network` per cent, fused as in a run, or that network alone."""
+def measure(folder: Path, seeds: list[int], name: str, network: float, alone: bool) -> None:
+    """Keep depth (0: none) and confidence of every keyframe by the product, or with a network
+    (0: without) that is off by `network` per cent, fused as in a run, or that network alone."""
     target = folder / "depth" / name
     target.mkdir(parents=True, exist_ok=True)
     for seed in seeds:
@@ -110,19 +96,26 @@ def measure(folder: Path, seeds: list[int], name: str, choice: bool, network: fl
         provider, frames = clip.stereo(folder / "stereo" / str(seed))
         learned = NetworkLike(dict(enumerate(clip.truth)), network, seed)
         start = time.process_time()
-        completion = Completion(provider, load_model(folder / MODEL) if choice else None)
         if network:
             found = in_unit_of_poses(sequence, learned if alone else FusedDepth(learned, provider, sequence))
         else:
-            found = [completion.estimate(f.id) if choice else provider.estimate(f) for f in frames]
+            found = [provider.estimate(f) for f in frames]
         spent = (time.process_time() - start) / len(frames)
         depth, confidence = np.stack([f.depth for f in found]), np.stack([f.confidence for f in found])
+        expected = [expected_error(provider, f.id, depth.shape[1:]) for f in frames]
         np.savez_compressed(
             target / f"{seed}.npz",
             depth=depth.astype(np.float16),
             confidence=confidence.astype(np.float16),
+            expected=np.stack(expected).astype(np.float16),
             spent=spent,
         )
+
+
+def expected_error(provider: MultiviewDepth, index: int, size: tuple[int, ...]) -> NDArray[np.float32]:
+    """(h, w) what the stereo expects of the error of a keyframe's log depth; 1 where it completes nothing."""
+    case = provider.case(index)
+    return resample_nearest(complete(case, "cpu")[1], *size) if case is not None else np.ones(size, np.float32)
 
 
 def in_unit_of_poses(sequence: Sequence, provider: DepthProvider) -> list[DepthEstimate]:
@@ -144,9 +137,9 @@ def table(folder: Path, seeds: list[int], names: list[str]) -> None:
         for name in names:
             with np.load(folder / "depth" / name / f"{seed}.npz", allow_pickle=False) as held:
                 depth, confidence = held["depth"].astype(np.float32), held["confidence"].astype(np.float32)
-                spent = float(held["spent"])
+                expected, spent = held["expected"] if "expected" in held else 1 - confidence, float(held["spent"])
             unsure = confidence < SURE if unsure is None else unsure
-            rows[seed][name] = np.array([*figures(depth, confidence, truth, unsure), spent])
+            rows[seed][name] = np.array([*figures(depth, expected, truth, unsure), spent])
     for kind in sorted(set(kinds.values())):
         _print(f"{kind} ({list(kinds.values()).count(kind)})", [rows[s] for s in seeds if kinds[s] == kind], np.mean)
     _print(f"all ({len(seeds)})", list(rows.values()), np.mean)
@@ -159,21 +152,32 @@ def table(folder: Path, seeds: list[int], names: list[str]) -> None:
         print(f"new / old: L1 {ratio[1]:.3f}, error of unsure pixels {ratio[4]:.3f}, sure pixels off {ratio[3]:.3f}")
 
 
-COLUMNS = ("unsure %", "L1 cm", "off %", "sure off %", "unsure error %", "unsure off %", "<2% off %", "L1 %", "CPU s")
+COLUMNS = (
+    "unsure %",
+    "L1 cm",
+    "off %",
+    "sure off %",
+    "unsure error %",
+    "unsure off %",
+    "<2% off %",
+    "<2% %",
+    "L1 %",
+    "CPU s",
+)
 
 
-def figures(depth: NDArray, confidence: NDArray, truth: NDArray, unsure: NDArray) -> tuple[float, ...]:
-    """Of a room, as COLUMNS; "unsure error" is the mean of |log depth ratio|, at most 1; "<2% off": of the pixels of
-    the highest confidence (0.4 or more) those that are off; "L1 %": of the median depth."""
+def figures(depth: NDArray, expected: NDArray, truth: NDArray, unsure: NDArray) -> tuple[float, ...]:
+    """Of a room, as COLUMNS; "unsure error" is the mean of |log depth ratio|, at most 1; "<2% off": of the pixels
+    whose expected error is below 2 % those that are off, "<2%": how many they are; "L1 %": of the median depth."""
     known = truth > 0
     unsure = unsure & known
     shown = np.where(depth > 0, depth, 1e-3)
     error = np.minimum(np.abs(np.log(shown[known] / truth[known])), 1)
     metres, off, guess = np.abs(depth - truth)[known], error > np.log(1 + OFF), unsure[known]
-    sure, trusted = ~guess, confidence[known] >= 0.4
+    sure, trusted = ~guess, expected[known] < 0.02
     shares = [100 * guess.mean(), 100 * metres.mean(), 100 * off.mean(), 100 * off[sure].mean()]
     guesses, of_median = [100 * error[guess].mean(), 100 * off[guess].mean()], metres.mean() / np.median(truth[known])
-    return (*shares, *guesses, 100 * off[trusted].mean(), 100 * of_median)
+    return (*shares, *guesses, 100 * off[trusted].mean(), 100 * trusted.mean(), 100 * of_median)
 
 
 def _print(title: str, rows: list[dict[str, NDArray]], summary: object) -> None:
@@ -190,22 +194,28 @@ def main() -> None:
     parser.add_argument("folder", type=Path, metavar="DIR")
     parser.add_argument("names", nargs="*", metavar="NAME")
     parser.add_argument("--set", choices=SETS, default="choose")
-    parser.add_argument("--choice", action="store_true", help="measure the learned choice, not the product")
     parser.add_argument("--network", type=float, default=0, metavar="PERCENT", help="measure it fused with a network")
     parser.add_argument("--alone", action="store_true", help="that network without the stereo")
     parser.add_argument("--rooms", type=int, default=0, help="only the first so many of the set")
     parser.add_argument("--package", type=Path, help="the .deb file of the furniture")
+    parser.add_argument("--seconds", type=float, default=560, help="of learning, the making of rooms included")
+    parser.add_argument("--workers", type=int, default=1, help="processes that make rooms to learn from")
+    parser.add_argument("--start", type=Path, metavar="NPZ", help="weights to learn on from")
+    parser.add_argument("--skip", type=int, default=0, help="rooms of the set `learn` that are left out")
     given = parser.parse_args()
     cv2.setNumThreads(1)
+    if given.what == "learn":
+        first, count = SETS["learn"]
+        furniture(str(given.folder), str(given.package or ""))
+        seeds = range(first + given.skip, first + count)
+        return print(learn(given.folder, seeds, given.seconds, given.workers, given.start))
     if given.what == "video":
         return make_videos(given.folder, given.set, given.package, given.rooms)
     seeds = seeds_of(given.folder, given.set, given.what == "make", given.package, given.rooms)
     if given.what == "measure":
-        measure(given.folder, seeds, *given.names, given.choice, given.network, given.alone)
+        measure(given.folder, seeds, *given.names, given.network, given.alone)
     elif given.what == "table":
         table(given.folder, seeds, given.names)
-    elif given.what == "learn":
-        learn_choice(given.folder, given.rooms)
 
 
 if __name__ == "__main__":

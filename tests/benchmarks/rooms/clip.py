@@ -88,26 +88,27 @@ class Clip:
         return provider, sequence.frames
 
 
-def make_clip(seed: int, catalogue: Catalogue) -> Clip | None:
-    """Build the room of a seed and film it; None where there is no place to walk."""
+def make_clip(seed: int, catalogue: Catalogue, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Clip | None:
+    """Build the room of a seed and film it at a size (width, height); None where there is no place to walk."""
     room, r = build_room(seed, catalogue)
     lit = LitRoom(room.surfaces)
     poses = _walk(room, lit, KEYFRAMES, r)
     if poses is None:
         return None
-    focal = float(r.uniform(0.7, 0.98))
-    shots = [lit.photograph(pose, WIDTH, HEIGHT, focal * WIDTH) for pose in poses]
+    focal, (width, height) = float(r.uniform(0.7, 0.98)), size
+    shots = [lit.photograph(pose, width, height, focal * width) for pose in poses]
     depths, classes = np.stack([d for _, d, _ in shots]), np.stack([c for _, _, c in shots])
     images = np.stack(_exposed([c for c, _, _ in shots], r))
     exact = np.linalg.inv(poses)
-    camera = Intrinsics(WIDTH, HEIGHT, focal * WIDTH, focal * WIDTH, WIDTH / 2, HEIGHT / 2)
+    camera = Intrinsics(width, height, focal * width, focal * width, width / 2, height / 2)
     sparse = _sparse_points(images, depths, exact, camera, r)
     known = _shaken(exact, float(r.choice([0, 0.0003, 0.0008])), r)
     return Clip(room.kind, focal, images, depths.astype(np.float16), classes, known, *sparse)
 
 
-def worn(clip: Clip, seed: int) -> Clip:
-    """The clip by a worse camera: noise, blur, distortion that is left, poses and focal length that are off by more."""
+def worn(clip: Clip, seed: int, shaken: float = 1.0) -> Clip:
+    """The clip by a worse camera: noise, blur, distortion that is left, poses (by `shaken` times as much) and focal
+    length that are off by more."""
     r = np.random.default_rng(seed)
     height, width = clip.images.shape[1:3]
     noise, blur, quality = r.uniform(0.5, 5), r.uniform(0, 1.2), int(r.integers(60, 95))
@@ -124,7 +125,7 @@ def worn(clip: Clip, seed: int) -> Clip:
         coarse = cv2.resize(r.normal(size=(height // 2, width // 2, 3)), (width, height))
         stored = np.clip(seen + noise * 0.7 * (r.normal(size=seen.shape) + coarse), 0, 255).astype(np.uint8)
         images.append(_compressed(stored, quality))
-    poses = _shaken(clip.cam_from_world, float(r.choice([0.0005, 0.001, 0.002])), r)
+    poses = _shaken(clip.cam_from_world, shaken * float(r.choice([0.0005, 0.001, 0.002])), r)
     poses[:, :3, 3] += np.cumsum(r.normal(size=(len(poses), 3)) * 0.0007, 0)
     focal = clip.focal * float(1 + r.normal() * 0.004)
     return replace(clip, images=np.stack(images), cam_from_world=poses, focal=focal)
