@@ -13,9 +13,9 @@ from ..providers import DepthEstimate, DepthProvider, Sequence
 from ..system.parallel import LruCache
 from ..types import Frame
 from .align import SAMPLES_ACROSS, Anchors, FieldModel, fit_fields, kept_views, posed_small, seen_points
+from .completion.fill import SURE
 from .fields import DepthFields, Grid, Prior
 from .scale import DepthScale, measure_scale
-from .completion.fill import SURE
 from .stereo.provider import MultiviewDepth
 
 _OF_NETWORK = FieldModel(Prior(Grid(13, 17), node_sd=0.06, step_sd=0.05), pair_sd=0.02, share=1.0)
