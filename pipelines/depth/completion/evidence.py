@@ -30,7 +30,7 @@ class Case:
     lent: Array
     sure: NDArray[np.bool_]
     found: Candidates
-    evidence: Array
+    evidence: NDArray[np.float16]
 
     @property
     def borrowed(self) -> NDArray[np.bool_]:
@@ -56,16 +56,16 @@ def gather_case(
     borrowed, sure = invert(depth), ~unsure | (mass > _LEAST)
     found = find_candidates(own, borrowed, mass, sure)
     evidence = _gather_evidence(found, own, mass, sure, lenders[:ASKED], asked)
-    return Case(own, borrowed, sure, found, evidence)
+    return Case(own, borrowed, sure, found, evidence.astype(np.float16))
 
 
 def ask_again(case: Case, views: list[Half], warps: list[NDArray[np.float64]]) -> Case:
     """Return the case with what the views say now that they are completed themselves."""
     if not views:
         return case
-    evidence = case.evidence.copy()
+    evidence = case.evidence.astype(np.float32)
     _ask_views(case.found.pixels, case.found.inverse, case.own.lab, *_stacked(views), np.stack(warps), evidence)
-    return replace(case, evidence=evidence)
+    return replace(case, evidence=evidence.astype(np.float16))
 
 
 def _stacked(views: list[Half]) -> tuple[Array, Array, Array]:

@@ -147,7 +147,7 @@ class MultiviewDepth:
         (depth, confidence), case = self._fused(index), self.case(index)
         if case is None:
             return depth, np.minimum(confidence, SURE)
-        small, error = complete(case, self._device)
+        small, error = complete(case, self._network_device)
         found, sure = upsample_depth(small, trusted(case, error), self._small(index)), confidence >= SURE
         trust = np.where(sure, confidence, np.minimum(found.confidence, LENT_CONFIDENCE))
         return np.where(sure, depth, found.depth), trust
@@ -170,7 +170,7 @@ class MultiviewDepth:
 
     def _complete_first(self, index: int) -> Half:
         case = self.first_case(index)
-        return self._half(index) if case is None else as_completed(case, self._device)
+        return self._half(index) if case is None else as_completed(case, self._network_device)
 
     def _half_warps(self, index: int, others: NDArray[np.int64]) -> list[NDArray[np.float64]]:
         return [HALF @ warp @ TWICE for warp in self._warps(index, others)]
@@ -224,6 +224,10 @@ class MultiviewDepth:
         return {"stereo_size": [self.camera.width, self.camera.height]}
 
     # what both use ----------------------------------------------------------------------------------------------
+
+    @property
+    def _network_device(self) -> str:
+        return "cpu" if self._card is None else self._device
 
     @cached_property
     def _card(self) -> ModuleType | None:
