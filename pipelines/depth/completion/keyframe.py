@@ -14,7 +14,7 @@ from ...geometry.voxels import to_lab
 from .candidates import LENT_CONFIDENCE, Array, Half, invert
 from .evidence import Case
 from .fill import SURE
-from .network import inputs_of, load_network, middle_of
+from .network import inputs_of, middle_of, weigh_candidates
 
 _MOST_CONFIDENCE, _FADING = 0.25, 0.05
 """Of a completed depth, and the expected error in log depth at which a part of 1 / e is left."""
@@ -43,7 +43,7 @@ def complete(case: Case, device: str) -> tuple[Array, Array]:
     """Return depth (h, w) at half the size, own, borrowed or completed, and its expected error in log depth (h, w)."""
     inverse = np.where(case.borrowed, case.lent, case.own.inverse)
     given = inputs_of(case, device)
-    found = load_network(device).evaluate(given)
+    found = weigh_candidates(given, device)
     error = np.exp(found.log_doubt.cpu().numpy())
     if len(case.found.pixels):
         logs, risk = (x.cpu().numpy() for x in middle_of(found))

@@ -10,6 +10,7 @@ import itertools
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 import torch
@@ -190,6 +191,17 @@ def middle_of(found: Mixture) -> tuple[Tensor, Tensor]:
     middle = logs.gather(1, before.clamp(max=logs.shape[1] - 1))
     apart, spread = (found.logs - middle).abs(), found.log_spread.exp()
     return middle[:, 0], (share * (apart + spread * torch.exp(-apart / spread)).clamp(max=1)).sum(1)
+
+
+_ONE_AT_A_TIME = Lock()
+"""Held while the network runs: it has threads of its own, and those of two callers can wait for each other."""
+
+
+@torch.no_grad()
+def weigh_candidates(given: Inputs, device: str) -> Mixture:
+    """Weigh the candidates of one keyframe by the network that comes with the program."""
+    with _ONE_AT_A_TIME:
+        return load_network(device).evaluate(given)
 
 
 @cache
