@@ -37,6 +37,11 @@ class Case:
         """(h, w) where others are sure and the keyframe is not."""
         return self.sure & (self.own.confidence < SURE)
 
+    @property
+    def spoken(self) -> Array:
+        """(h, w) inverse depth where it is sure, own or borrowed; 0 elsewhere."""
+        return np.where(self.borrowed | (self.own.confidence <= 0), self.lent, self.own.inverse) * self.sure
+
 
 def gather_case(
     own: Half, lenders: list[Half], lent: list[NDArray[np.float64]], asked: list[NDArray[np.float64]]

@@ -63,8 +63,7 @@ class Mixture:
 
 def inputs_of(case: Case, device: str = "cpu") -> Inputs:
     """Bring a keyframe's case to the network's inputs."""
-    own, sure = case.own, case.sure
-    spoken = np.where(case.borrowed | (own.confidence <= 0), case.lent, own.inverse) * sure
+    own, sure, spoken = case.own, case.sure, case.spoken
     reference = float(np.log(_lower_median(spoken[spoken > 0])))
     colors = own.lab / np.array([50, 30, 30], np.float32) - np.array([1, 0, 0], np.float32)
     relative = (_relative(spoken, reference), _relative(own.inverse, reference))

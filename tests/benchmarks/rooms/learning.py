@@ -161,8 +161,7 @@ def example_arrays(case: Case, truth: Array) -> dict[str, NDArray]:
     given = inputs_of(case)
     known = truth > 0
     wanted = np.where(known, -np.log(np.maximum(truth, 1e-6)) - np.float32(given.reference), np.float32(0))
-    at = case.found.pixels
-    spoken = np.where(case.borrowed | (case.own.confidence <= 0), case.lent, case.own.inverse) * case.sure
+    at, spoken = case.found.pixels, case.spoken
     relative = np.log(np.maximum(spoken, 1e-9)) - np.float32(given.reference)
     return {
         "planes": given.planes.numpy().astype(np.float16),
