@@ -10,7 +10,13 @@ from ...system.jit import kernel
 from .candidates import Array, Candidates, Half, find_candidates, invert
 from .fill import SURE, agreed_depth, carry_depth
 
-FEATURES = 19
+Bytes = NDArray[np.uint8]
+OF_CANDIDATE, OF_PLACE = 13, 6
+FEATURES = OF_CANDIDATE + OF_PLACE
+"""Numbers that are known of each candidate of a pixel, and of the pixel."""
+LEAST_NUMBER, STEP_OF_NUMBERS = -0.75, 0.75 / 68
+"""They are kept as bytes: the value of 0, and what one more is worth."""
+_NOTHING = 68
 _SAME = np.float32(0.004)
 """Candidates whose depths differ by less, relatively, are asked about once."""
 LENDERS, ASKED = 16, 6
@@ -30,7 +36,8 @@ class Case:
     lent: Array
     sure: NDArray[np.bool_]
     found: Candidates
-    evidence: NDArray[np.float16]
+    evidence: Bytes
+    place: Bytes
 
     @property
     def borrowed(self) -> NDArray[np.bool_]:
@@ -60,17 +67,21 @@ def gather_case(
     depth, mass = agreed_depth(carried, unsure) if carried else (np.zeros_like(own.inverse),) * 2
     borrowed, sure = invert(depth), ~unsure | (mass > _LEAST)
     found = find_candidates(own, borrowed, mass, sure)
-    evidence = _gather_evidence(found, own, mass, sure, lenders[:ASKED], asked)
-    return Case(own, borrowed, sure, found, evidence.astype(np.float16))
+    evidence = np.empty((*found.inverse.shape, OF_CANDIDATE), np.uint8)
+    _weigh_support(found.pixels, found.support, found.weight, own.lab, evidence)
+    case = Case(own, borrowed, sure, found, evidence, _describe_places(found.pixels, own, mass, sure))
+    return ask_again(case, lenders[:ASKED], asked)
 
 
 def ask_again(case: Case, views: list[Half], warps: list[NDArray[np.float64]]) -> Case:
-    """Return the case with what the views say now that they are completed themselves."""
-    if not views:
-        return case
-    evidence = case.evidence.astype(np.float32)
-    _ask_views(case.found.pixels, case.found.inverse, case.own.lab, *_stacked(views), np.stack(warps), evidence)
-    return replace(case, evidence=evidence.astype(np.float16))
+    """Return the case with what the views say of its candidates; warps (3, 4) lead from the keyframe's pixels to
+    theirs. What it was without views says nothing."""
+    evidence, own = case.evidence.copy(), case.own
+    if views:
+        _ask_views(case.found.pixels, case.found.inverse, own.lab, *_stacked(views), np.stack(warps), evidence)
+    else:
+        evidence[..., 3:] = _NOTHING
+    return replace(case, evidence=evidence)
 
 
 def _stacked(views: list[Half]) -> tuple[Array, Array, Array]:
@@ -78,36 +89,42 @@ def _stacked(views: list[Half]) -> tuple[Array, Array, Array]:
     return np.stack(inverse), np.stack(confidence), np.stack(lab)
 
 
-def _gather_evidence(
-    found: Candidates,
-    own: Half,
-    mass: Array,
-    sure: NDArray[np.bool_],
-    views: list[Half],
-    warps: list[NDArray[np.float64]],
-) -> Array:
-    """Return (P, K, FEATURES) numbers, zeros for a kind that says nothing; mass and sure (h, w) as of
-    `find_candidates`, the warps (3, 4) lead from the pixels of the keyframe to those of the views."""
-    lab = own.lab
-    out = np.zeros((*found.inverse.shape, FEATURES), np.float32)
-    y, x = np.divmod(found.pixels, sure.shape[1])
-    sy, sx = np.divmod(found.support, sure.shape[1])
-    out[..., 0] = np.log1p(np.hypot(sy - y[:, None], sx - x[:, None])) / 5
-    out[..., 1] = np.minimum(np.linalg.norm(lab[sy, sx] - lab[y, x][:, None], axis=-1) / 30, 2)
-    out[..., 2] = found.weight
-    if views:
-        _ask_views(found.pixels, found.inverse, lab, *_stacked(views), np.stack(warps), out)
+def _describe_places(pixels: NDArray[np.int64], own: Half, mass: Array, sure: NDArray[np.bool_]) -> Bytes:
+    """Return (P, OF_PLACE) for flat indices (P,); mass and sure (h, w) as of `find_candidates`: confidence of the
+    match, agreement of others, distance to what is sure, contrast, roughness and density of the matches around."""
     far = cv2.distanceTransform((~sure).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     around = np.maximum(cv2.medianBlur(own.inverse, 5), 1e-9)
     away = np.minimum(np.abs(np.log(np.maximum(own.inverse, 1e-9) / around)), np.float32(0.5))
-    of_pixel = (
+    numbers = (
         own.confidence, np.minimum(mass / 4, 1), np.log1p(far) / 5, np.log10(own.contrast + 1e-7) / 4 + 1,
         np.sqrt(cv2.blur(away, (7, 7))), cv2.blur((own.inverse > 0).astype(np.float32), (7, 7)),
     )  # fmt: skip
-    for k, values in enumerate(of_pixel, FEATURES - len(of_pixel)):
-        out[..., k] = values[y, x][:, None]
-    out[found.inverse <= 0] = 0
-    return out
+    at = np.stack([values.ravel()[pixels] for values in numbers], -1)
+    return np.clip(np.rint((at - LEAST_NUMBER) / STEP_OF_NUMBERS), 0, 255).astype(np.uint8)
+
+
+@kernel
+def _as_byte(value: float) -> int:
+    return int(min(max(np.rint((value - LEAST_NUMBER) / STEP_OF_NUMBERS), 0.0), 255.0))
+
+
+@kernel
+def _weigh_support(
+    pixels: NDArray[np.int64], support: NDArray[np.int32], weight: Array, lab: Array, out: Bytes
+) -> None:
+    """Features 0 to 2: how far off the sure pixel is that a candidate comes from, how different its colour, and how
+    much there is behind it."""
+    width = lab.shape[1]
+    for p in range(len(pixels)):
+        y, x = pixels[p] // width, pixels[p] % width
+        for k in range(support.shape[1]):
+            sy, sx = support[p, k] // width, support[p, k] % width
+            apart = 0.0
+            for c in range(3):
+                apart += (lab[sy, sx, c] - lab[y, x, c]) ** 2
+            out[p, k, 0] = _as_byte(np.log1p(np.sqrt(float((sy - y) ** 2 + (sx - x) ** 2))) / 5)
+            out[p, k, 1] = _as_byte(min(np.sqrt(apart) / 30, 2.0))
+            out[p, k, 2] = _as_byte(weight[p, k])
 
 
 @kernel
@@ -119,70 +136,74 @@ def _ask_views(
     trust: Array,
     colors: Array,
     warps: NDArray[np.float64],
-    out: Array,
+    out: Bytes,
 ) -> None:
     """Features 3 to 12: in how many views the candidate is on, in front of and behind what they surely see there, on
     and in front of what they matched unsurely, seen at all; how much the colours differ there."""
-    views, width, votes = len(seen), seen.shape[2], np.zeros(9)
+    views, width, votes, ray = len(seen), seen.shape[2], np.zeros(9), np.zeros((len(seen), 3))
     for p in range(len(pixels)):
         y, x = pixels[p] // width, pixels[p] % width
+        for v in range(views):
+            for i in range(3):
+                ray[v, i] = warps[v, i, 0] * (x + 0.5) + warps[v, i, 1] * (y + 0.5) + warps[v, i, 2]
         for k in range(inverse.shape[1]):
-            if inverse[p, k] <= 0:
+            alike = _earlier(inverse, p, k)
+            if inverse[p, k] <= 0 or alike >= 0:
+                for n in range(3, OF_CANDIDATE):
+                    out[p, k, n] = out[p, alike, n] if alike >= 0 else 0
                 continue
-            alike = _earlier(inverse[p], k)
-            if alike >= 0:
-                out[p, k, 3:13] = out[p, alike, 3:13]
-                continue
-            votes[:] = 0
+            for n in range(8):
+                votes[n] = 0.0
             votes[8] = 2.0
             for v in range(views):
-                _vote(y, x, 1 / np.float64(inverse[p, k]), lab[y, x], seen[v], trust[v], colors[v], warps[v], votes)
+                _vote(v, 1 / np.float64(inverse[p, k]), ray, warps, lab, y, x, seen, trust, colors, votes)
             inside, shown = max(votes[5], 1.0), votes[6]
             for n in range(5):  # on, through, behind, weakly on, weakly through
-                out[p, k, 3 + n] = votes[n] / inside
-            out[p, k, 8], out[p, k, 9] = votes[5] / views, shown / inside
-            out[p, k, 10], out[p, k, 11] = votes[7] / shown if shown > 0 else 1.0, votes[8]
-            out[p, k, 12] = min(votes[0], 3.0) / 3
+                out[p, k, 3 + n] = _as_byte(votes[n] / inside)
+            out[p, k, 8], out[p, k, 9] = _as_byte(votes[5] / views), _as_byte(shown / inside)
+            out[p, k, 10] = _as_byte(votes[7] / shown if shown > 0 else 1.0)
+            out[p, k, 11], out[p, k, 12] = _as_byte(votes[8]), _as_byte(min(votes[0], 3.0) / 3)
 
 
 @kernel
-def _earlier(inverse: Array, k: int) -> int:
-    """An earlier candidate that is as good as the same depth; -1 where there is none."""
+def _earlier(inverse: Array, p: int, k: int) -> int:
+    """An earlier candidate of a pixel that is as good as the same depth; -1 where there is none."""
     for m in range(k):
-        if abs(inverse[m] - inverse[k]) < _SAME * inverse[k]:
+        if abs(inverse[p, m] - inverse[p, k]) < _SAME * inverse[p, k]:
             return m
     return -1
 
 
 @kernel
 def _vote(
+    v: int,
+    z: float,
+    ray: NDArray[np.float64],
+    warps: NDArray[np.float64],
+    lab: Array,
     y: int,
     x: int,
-    z: float,
-    color: Array,
     seen: Array,
     trust: Array,
     colors: Array,
-    warp: NDArray[np.float64],
     votes: NDArray[np.float64],
 ) -> None:
-    """Add what one view says of depth z at a pixel: on, through, behind, weakly on, weakly through what it has there,
-    inside of it, not hidden, difference of colour; and lessen the least difference of colour."""
-    height, width = seen.shape
-    u, v = x + 0.5, y + 0.5
-    qz = z * (warp[2, 0] * u + warp[2, 1] * v + warp[2, 2]) + warp[2, 3]
+    """Add what view v says of depth z along the ray of a pixel: on, through, behind, weakly on, weakly through what it
+    has there, inside of it, not hidden, difference of colour; and lessen the least difference of colour."""
+    # Whole arrays are passed: each part of one is an object to numba, and counting its references takes longest.
+    height, width = seen.shape[1:]
+    qz = z * ray[v, 2] + warps[v, 2, 3]
     if qz <= 1e-6 * z:
         return
-    qx = (z * (warp[0, 0] * u + warp[0, 1] * v + warp[0, 2]) + warp[0, 3]) / qz - 0.5
-    qy = (z * (warp[1, 0] * u + warp[1, 1] * v + warp[1, 2]) + warp[1, 3]) / qz - 0.5
+    qx, qy = (z * ray[v, 0] + warps[v, 0, 3]) / qz - 0.5, (z * ray[v, 1] + warps[v, 1, 3]) / qz - 0.5
     left, top = int(np.floor(qx)), int(np.floor(qy))
     if left < 0 or top < 0 or left + 1 >= width or top + 1 >= height:
         return
     votes[5] += 1
     near_y, near_x = int(np.floor(qy + 0.5)), int(np.floor(qx + 0.5))
-    if seen[near_y, near_x] > 0:
-        ratio = qz * seen[near_y, near_x]  # of the depths
-        if trust[near_y, near_x] >= SURE:
+    if seen[v, near_y, near_x] > 0:
+        ratio = qz * seen[v, near_y, near_x]  # of the depths
+        if trust[v, near_y, near_x] >= SURE:
             votes[0] += abs(ratio - 1) < 0.02
             votes[1] += ratio < 0.97
             if ratio > 1.03:
@@ -193,9 +214,9 @@ def _vote(
             votes[4] += ratio < 0.95
     fx, fy, apart = qx - left, qy - top, 0.0
     for c in range(3):
-        above = colors[top, left, c] * (1 - fx) + colors[top, left + 1, c] * fx
-        below = colors[top + 1, left, c] * (1 - fx) + colors[top + 1, left + 1, c] * fx
-        step = above * (1 - fy) + below * fy - color[c]
+        above = colors[v, top, left, c] * (1 - fx) + colors[v, top, left + 1, c] * fx
+        below = colors[v, top + 1, left, c] * (1 - fx) + colors[v, top + 1, left + 1, c] * fx
+        step = above * (1 - fy) + below * fy - lab[y, x, c]
         apart += step * step * (0.5 if c == 0 else 1.0)
     apart = min(np.sqrt(apart) / 20, 2.0)
     votes[6] += 1

@@ -16,14 +16,16 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from ....formats.tensors import load_arrays
 from .candidates import KINDS, Array
-from .evidence import FEATURES, Case
+from .evidence import FEATURES, LEAST_NUMBER, OF_CANDIDATE, STEP_OF_NUMBERS, Case
 
 WEIGHTS = Path(__file__).parent / "weights.npz"
 _PLANES, _BESIDE = 10, 3
 """Of an image's input, and numbers that a candidate has by its depth beside the evidence."""
+_COLUMNS = (OF_CANDIDATE, FEATURES - OF_CANDIDATE, _BESIDE, len(KINDS))
 _HIDDEN, _CONTEXT, _BROUGHT = 48, 24, 16
 _WIDTHS = (30, 45, 60, 90)
 _MOST_CORRECTION = 0.2
@@ -32,19 +34,20 @@ _NEVER = -30.0
 _ALIKE = 0.02
 _SOFTENED = 2.0
 """Log probabilities are divided by it: a network is surer of made rooms, which it learned, than of others."""
-_BLOCK = 2048
+_BLOCK = 1024
 """Pixels whose candidates are read at once."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """Inputs of one keyframe: planes (10, h, w); of the P pixels that are not sure, flat indices (P,), what is known of
-    their candidates (P, K, F), which of them there are (P, K) and log inverse depths (P, K) over the keyframe's median,
-    whose logarithm is `reference`."""
+    """Inputs of one keyframe: planes (10, h, w); of the P pixels that are not sure, flat indices (P,), evidence of
+    their candidates (P, K, OF_CANDIDATE) and places (P, OF_PLACE) as of `Case`, which candidates there are (P, K) and
+    their log inverse depths (P, K) over the keyframe's median, whose logarithm is `reference`."""
 
     planes: Tensor
     pixels: Tensor
-    features: Tensor
+    evidence: Tensor
+    place: Tensor
     real: Tensor
     logs: Tensor
     reference: float
@@ -74,14 +77,23 @@ def inputs_of(case: Case, device: str = "cpu") -> Inputs:
     inverse = case.found.inverse
     real = inverse > 0
     logs = np.where(real, np.log(np.maximum(inverse, 1e-9)) - np.float32(reference), np.float32(0))
-    count = np.maximum(real.sum(1, keepdims=True), 1)
-    alike = np.stack([((np.abs(logs[:, [k]] - logs) < _ALIKE) & real).sum(1) for k in range(len(KINDS))], 1) / count
-    apart = np.clip((logs - (logs * real).sum(1, keepdims=True) / count) * 3, -2, 2)
-    beside = np.stack([alike, apart, np.clip(logs, -2, 2)], -1) * real[..., None]
-    features = np.concatenate([case.evidence, beside], -1, dtype=np.float32)
-    arrays = (planes, case.found.pixels, features, real, logs)
-    planes_, pixels, known, there, of = (torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays)
-    return Inputs(planes_, pixels, known, there, of, reference)
+    arrays = (planes, case.found.pixels, case.evidence, case.place, real, logs)
+    planes_, pixels, evidence, place, there, of = (torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays)
+    return Inputs(planes_, pixels, evidence, place, there, of, reference)
+
+
+def numbers_of(kept: Tensor) -> Tensor:
+    """Bring evidence from bytes back to numbers."""
+    return kept.float() * STEP_OF_NUMBERS + LEAST_NUMBER
+
+
+def compare(logs: Tensor, real: Tensor) -> Tensor:
+    """Return (P, K, 3) of log inverse depths (P, K): share of the candidates that are as good as it, difference to
+    their mean, and depth."""
+    count = real.sum(1, keepdim=True).clamp(min=1)
+    alike = (((logs[:, :, None] - logs[:, None]).abs() < _ALIKE) & real[:, None]).sum(2) / count
+    apart = ((logs - (logs * real).sum(1, keepdim=True) / count) * 3).clamp(-2, 2)
+    return torch.stack([alike, apart, logs.clamp(-2, 2)], -1) * real[..., None]
 
 
 def _relative(inverse: Array, reference: float) -> Array:
@@ -101,8 +113,14 @@ class _Block(nn.Module):
         self.two = nn.Conv2d(after, after, 3, padding=1, bias=False)
         self.n1, self.n2 = nn.BatchNorm2d(after), nn.BatchNorm2d(after)
 
+    def fuse(self) -> None:
+        """Take the normalisation into the convolutions, for a network that learns no more."""
+        for conv, norm in (("one", "n1"), ("two", "n2")):
+            setattr(self, conv, fuse_conv_bn_eval(getattr(self, conv), getattr(self, norm)))
+            setattr(self, norm, nn.Identity())
+
     def forward(self, x: Tensor) -> Tensor:
-        return F.relu(self.n2(self.two(F.relu(self.n1(self.one(x))))))
+        return self.n2(self.two(self.n1(self.one(x)).relu_())).relu_()
 
 
 class CompletionNetwork(nn.Module):
@@ -120,29 +138,28 @@ class CompletionNetwork(nn.Module):
         self.up = nn.ModuleList(_Block(b + a, a) for a, b in itertools.pairwise(w))
         self.out = nn.Conv2d(w[0], 2 * _CONTEXT + 1, 1)
 
-    def read(self, features: Tensor, real: Tensor) -> Tensor:
-        """Read candidates by their features (P, K, F): (P, K, hidden), 0 where there is none."""
-        weight, size = self.first.weight, features.shape[-1]
-        # The last columns are of the kinds: no ones and zeros are made for them.
-        hidden = features @ weight[:, :size].T + (weight[:, size:].T + self.first.bias)
-        return F.relu(hidden) * real[..., None]
+    def read(self, evidence: Tensor, place: Tensor, beside: Tensor, real: Tensor) -> Tensor:
+        """Read candidates by numbers (P, K, OF_CANDIDATE), (P, OF_PLACE) and (P, K, 3): (P, K, hidden), 0 where there
+        is none."""
+        of_candidate, of_place, of_depth, of_kind = self.first.weight.split(_COLUMNS, 1)
+        hidden = torch.cat([evidence, beside], -1) @ torch.cat([of_candidate, of_depth], 1).T
+        # No ones and zeros are made for the kinds, and the place is read once.
+        hidden = hidden.add_(of_kind.T).add_(F.linear(place, of_place, self.first.bias)[:, None])
+        return hidden.relu_() * real[..., None]
 
     def gather(self, hidden: Tensor, real: Tensor) -> Tensor:
         """Gather what all candidates of a pixel say of it: (P, hidden)."""
         mean = hidden.sum(1) / real.sum(1, keepdim=True).clamp(min=1)
-        return F.relu(self.around(torch.cat([mean, hidden.max(1).values], -1)))
+        return self.around(torch.cat([mean, hidden.amax(1)], -1)).relu_()
 
-    def look_around(self, planes: Tensor, pixels: list[Tensor], gathered: list[Tensor]) -> Tensor:
-        """Return (B, 2 C + 1, h, w): context for candidates and for the image's own depth, log spread of what is sure;
-        of B keyframes' planes and what was gathered at their pixels."""
-        height, width = planes.shape[2:]
-        brought = []
-        for at, values in zip(pixels, gathered, strict=True):
-            image = planes.new_zeros(height * width, _BROUGHT + 1)
-            image[at, :-1] = F.relu(self.bring(values)).to(image.dtype)
-            image[at, -1] = 1
-            brought.append(image.T.reshape(-1, height, width))
-        x = torch.cat([planes, torch.stack(brought)], 1)
+    def look_around(self, planes: Tensor, pixels: Tensor, gathered: Tensor) -> Tensor:
+        """Return (B, h, w, 2 C + 1): context for candidates and for the image's own depth, log spread of what is sure;
+        of B keyframes' planes (B, 10, h, w) and what was gathered at pixels (P,) of all of them, one after another."""
+        batch, _, height, width = planes.shape
+        brought = planes.new_zeros(batch * height * width, _BROUGHT + 1)
+        values = F.relu(self.bring(gathered)).to(planes.dtype)
+        brought[pixels] = torch.cat([values, torch.ones_like(values[:, :1])], 1)
+        x = torch.cat([planes, brought.reshape(batch, height, width, -1).permute(0, 3, 1, 2)], 1)
         x = F.pad(x, (0, -width % 8, 0, -height % 8), mode="replicate")
         stack = []
         for level, down in enumerate(self.down):
@@ -151,33 +168,38 @@ class CompletionNetwork(nn.Module):
         stack.pop()
         for up in reversed(self.up):
             x = up(torch.cat([F.interpolate(x, scale_factor=2, mode="nearest"), stack.pop()], 1))
-        return self.out(x)[:, :, :height, :width]
+        return self.out(x)[:, :, :height, :width].permute(0, 2, 3, 1)
 
     def weigh(self, hidden: Tensor, real: Tensor, gathered: Tensor, context: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return log probability, correction of the log inverse depth and log spread (P, K + 1) of the candidates and
         of the image's own depth, which starts from the first candidate; context (P, 2 C) as of `look_around`."""
         mine = context[:, :_CONTEXT] + self.pixel(gathered)
-        each = self.last(F.relu(self.second(hidden) + mine[:, None])).float()
-        alone = self.alone(F.relu(context[:, _CONTEXT:] + mine)).float()
+        each = self.last(self.second(hidden).add_(mine[:, None]).relu_()).float()
+        alone = self.alone((context[:, _CONTEXT:] + mine).relu_()).float()
         share = torch.cat([each[..., 0].masked_fill(~real, _NEVER), alone[:, :1]], 1)
         moved = torch.cat([_MOST_CORRECTION * torch.tanh(each[..., 1]), alone[:, 1:2].clamp(-3, 3)], 1)
         spread = torch.cat([each[..., 2], alone[:, 2:]], 1).clamp(-4.8, -0.3)
         return torch.log_softmax(share, 1), moved, spread
+
+    @staticmethod
+    def _numbers(given: Inputs, block: slice) -> tuple[Tensor, Tensor, Tensor]:
+        beside = compare(given.logs[block], given.real[block])
+        return numbers_of(given.evidence[block]), numbers_of(given.place[block]), beside
 
     @torch.no_grad()
     def evaluate(self, given: Inputs) -> Mixture:
         """Weigh the candidates of one keyframe."""
         starts = range(0, max(len(given.pixels), 1), _BLOCK)  # one block, empty, where every pixel is sure
         blocks = [slice(first, first + _BLOCK) for first in starts]
-        read = [self.read(given.features[b], given.real[b]) for b in blocks]
+        read = [self.read(*self._numbers(given, b), given.real[b]) for b in blocks]
         gathered = [self.gather(h, given.real[b]) for h, b in zip(read, blocks, strict=True)]
         planes = given.planes[None].contiguous(memory_format=torch.channels_last)
-        around = self.look_around(planes, [given.pixels], [torch.cat(gathered)])[0]
-        context = around[:-1].flatten(1)[:, given.pixels].T
+        around = self.look_around(planes, given.pixels, torch.cat(gathered))[0]
+        context = around[..., :-1].flatten(0, 1)[given.pixels]
         parts = [self.weigh(h, given.real[b], g, context[b]) for h, g, b in zip(read, gathered, blocks, strict=True)]
         share, moved, spread = (torch.cat(column) for column in zip(*parts, strict=True))
         logs = torch.cat([given.logs, given.logs[:, :1]], 1) + moved
-        return Mixture(torch.log_softmax(share / _SOFTENED, 1), logs, spread, around[-1].float().clamp(-5.8, 0))
+        return Mixture(torch.log_softmax(share / _SOFTENED, 1), logs, spread, around[..., -1].float().clamp(-5.8, 0))
 
 
 @torch.no_grad()
@@ -209,6 +231,9 @@ def load_network(device: str = "cpu") -> CompletionNetwork:
     network = CompletionNetwork()
     weights = {k: torch.from_numpy(v.astype(np.float32)) for k, v in load_arrays(WEIGHTS).items()}
     network.load_state_dict(weights, strict=False)  # how many batches were seen is not kept
+    network.eval()
+    for block in (b for b in network.modules() if isinstance(b, _Block)):
+        block.fuse()
     # Convolutions take two thirds of the time with the channels last.
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return network.eval().to(device)
+    return network.to(device)

@@ -40,7 +40,6 @@ from .furniture import furniture
 from .learning import learn
 from .network import NetworkLike
 from .room import KINDS, kind_of
-from .video import make_video
 
 SETS = {"choose": (1000, 40), "judge": (2000, 40), "learn": (30_000, 2000)}
 """First seed and number of rooms; seeds without a place to walk are passed over."""
@@ -71,6 +70,8 @@ def seeds_of(folder: Path, name: str, make: bool = False, package: Path | None =
 
 def make_videos(folder: Path, name: str, package: Path | None, most: int) -> None:
     """Leave videos of rooms of a set: the first home, office, classroom and bare room, then the second of each."""
+    from .video import make_video  # imports av
+
     first, count = SETS[name]
     seeds = {kind: iter([s for s in range(first, first + 2 * count) if kind_of(s) == kind]) for kind in KINDS}
     for kind in itertools.islice(itertools.cycle(seeds), most or len(seeds)):
@@ -200,6 +201,7 @@ def main() -> None:
     parser.add_argument("--package", type=Path, help="the .deb file of the furniture")
     parser.add_argument("--seconds", type=float, default=560, help="of learning, the making of rooms included")
     parser.add_argument("--workers", type=int, default=1, help="processes that make rooms to learn from")
+    parser.add_argument("--pause", type=float, default=0, help="seconds until a pause; the next call goes on")
     parser.add_argument("--start", type=Path, metavar="NPZ", help="weights to learn on from")
     parser.add_argument("--skip", type=int, default=0, help="rooms of the set `learn` that are left out")
     given = parser.parse_args()
@@ -208,7 +210,7 @@ def main() -> None:
         first, count = SETS["learn"]
         furniture(str(given.folder), str(given.package or ""))
         seeds = range(first + given.skip, first + count)
-        return print(learn(given.folder, seeds, given.seconds, given.workers, given.start))
+        return print(learn(given.folder, seeds, given.seconds, given.workers, given.start, given.pause))
     if given.what == "video":
         return make_videos(given.folder, given.set, given.package, given.rooms)
     seeds = seeds_of(given.folder, given.set, given.what == "make", given.package, given.rooms)

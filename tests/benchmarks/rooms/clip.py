@@ -77,12 +77,12 @@ class Clip:
         calibration = Calibration(self.camera, "given", 0.0, (0.0, 0.0, 0.0, 0.0))
         return Sequence(frames, calibration, self.camera, model, lambda f: self.images[f.id])
 
-    def stereo(self, folder: Path) -> tuple[MultiviewDepth, list[Frame]]:
-        """The product's stereo, its first pass done; that is kept in the folder."""
+    def stereo(self, folder: Path, device: str = "cpu") -> tuple[MultiviewDepth, list[Frame]]:
+        """The product's stereo on a device, its first pass done; that is kept in the folder."""
         sequence = self.sequence()
         folder.mkdir(parents=True, exist_ok=True)
         provider = MultiviewDepth(
-            sequence, max(self.camera.width, self.camera.height), PLANES, lambda: folder, 1, SilentProgress()
+            sequence, max(self.camera.width, self.camera.height), PLANES, lambda: folder, 1, SilentProgress(), device
         )
         provider.fit(sequence.frames)
         return provider, sequence.frames

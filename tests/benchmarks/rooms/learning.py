@@ -1,5 +1,5 @@
-"""Learning of the network that completes depth, from made rooms alone: all but one core make rooms, the stereo on them
-and its candidates, while the network learns from what there is, best on a card.
+"""Learning of the network that completes depth, from made rooms alone: processes make rooms, the stereo on them and its
+candidates, while the network learns from what there is, best on a card.
 
 Rooms come in the order of their seeds, but how many there are when a step is taken depends on the machine: a second
 learning gives a network as good as the first, not the same bytes.
@@ -8,7 +8,10 @@ learning gives a network as good as the first, not the same bytes.
 import math
 import multiprocessing
 import shutil
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,13 +25,15 @@ from msgs_slam.formats.tensors import load_arrays, save_arrays
 from msgs_slam.pipelines.depth.completion.candidates import KINDS
 from msgs_slam.pipelines.depth.completion.evidence import Case
 from msgs_slam.pipelines.depth.completion.fill import SURE
-from msgs_slam.pipelines.depth.completion.network import CompletionNetwork, Inputs, inputs_of
+from msgs_slam.pipelines.depth.completion.network import CompletionNetwork, Inputs, compare, inputs_of, numbers_of
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
 
 from .clip import make_clip, worn
 from .furniture import furniture
 
-SIZES = ((384, 288), (448, 336), (448, 336), (512, 384), (576, 432), (336, 448))
+SIZES = ((384, 288), (448, 336), (448, 336), (640, 480), (640, 480), (640, 360), (360, 640))
+_KEPT = 9
+"""Keyframes of a room that are learned from: there is more to learn from other rooms."""
 _LEAST_PIXELS = 200
 _BATCH, _RATE, _DECAY = 8, 3e-3, 2e-3
 _HIDDEN, _RECOLORED, _COLORLESS = 0.1, 0.15, 0.08
@@ -37,6 +42,12 @@ seldom like those that were made."""
 _RISK, _DOUBT = 4.0, 0.3
 """Weight of the expected error beside the likelihood, and of the spread of what is sure."""
 _SPARED_BYTES = 9e9
+_AGAIN = 2 / 3
+"""Share of the keyframes whose neighbours are asked completed, by the network that the program has."""
+_MADE_UNTIL = 0.72
+"""Part of the time in which rooms are made."""
+_FEWEST, _READERS = 150, 3
+"""Examples to begin with, and threads that read them."""
 _SWAPPED = {"left": "right", "right": "left", "left line": "right line", "right line": "left line"}
 _MIRRORED = [KINDS.index(_SWAPPED.get(kind, kind)) for kind in KINDS]
 _UNKNOWN = 99.0
@@ -55,9 +66,9 @@ def half_truth(depth: NDArray) -> Array:
     return np.asarray(middle, np.float32)
 
 
-def room_cases(seed: int, folder: Path) -> list[tuple[Case, Array]]:
-    """Film the room of a seed, three of five by a worse camera, and gather the cases of its keyframes with the true
-    depth (h, w) at half the size; none where there is no place to walk."""
+def room_cases(seed: int, folder: Path, device: str = "cpu") -> list[tuple[Case, Array]]:
+    """Film the room of a seed, three of five by a worse camera, and gather the cases of its keyframes, by the stereo on
+    a device, with the true depth (h, w) at half the size; none where there is no place to walk."""
     rng, as_worn = np.random.default_rng(seed + 5), seed % 5 in (1, 2, 3)
     clip = make_clip(seed, furniture(str(folder)), SIZES[int(rng.integers(len(SIZES)))])
     if clip is None:
@@ -65,15 +76,17 @@ def room_cases(seed: int, folder: Path) -> list[tuple[Case, Array]]:
     clip = worn(clip, seed, shaken=0.5) if as_worn else clip
     maps = folder / "stereo" / str(seed)
     try:
-        provider, frames = clip.stereo(maps)
+        provider, frames = clip.stereo(maps, device)
         if (as_worn or seed % 5 == 4) and rng.random() < 0.75:
             _match_falsely(provider, seed)
-        found = [(provider.first_case(k), half_truth(clip.truth[k])) for k in range(len(frames))]
+        kept = np.sort(rng.permutation(len(frames))[:_KEPT])
+        cases = [provider.case(k) if rng.random() < _AGAIN else provider.first_case(k) for k in kept.tolist()]
     finally:
         shutil.rmtree(maps, ignore_errors=True)
+    truths = [half_truth(clip.truth[k]) for k in kept]
     return [
         (case, _scaled(case, truth) if as_worn else truth)
-        for case, truth in found
+        for case, truth in zip(cases, truths, strict=True)
         if case is not None and len(case.found.pixels) >= _LEAST_PIXELS
     ]
 
@@ -129,85 +142,103 @@ def _patches(
 
 @dataclass(frozen=True)
 class Example:
-    """A keyframe to learn from: the network's inputs; error (P, K) of each candidate's log inverse depth, where it is
-    `known` (P,); and error (h, w) of what is sure, 99 where there is none. Where candidates are good it counts more."""
+    """A keyframe to learn from: the network's inputs; log inverse depth (P,) that is wanted, NaN where it is not known;
+    and error (h, w) of what is sure, 99 where there is none. Where candidates are good it counts more."""
 
     given: Inputs
-    error: Tensor
-    known: Tensor
+    wanted: Tensor
     sure_error: Tensor
     weight: float
 
     @classmethod
     def of(cls, arrays: dict[str, NDArray], device: str) -> "Example":
         """Load what `example_arrays` gave."""
-        of = {name: torch.from_numpy(values).to(device) for name, values in arrays.items()}
-        given = Inputs(*(of[n] for n in ("planes", "pixels", "features", "real", "logs")), 0.0)
-        fill = of["error"][:, 0].abs().clamp(max=1)[of["known"]].float().mean()
-        return cls(given, of["error"], of["known"], of["sure_error"], 1 / (float(fill) + 0.08))
+        of = {name: torch.from_numpy(values).to(device) for name, values in arrays.items() if name != "weight"}
+        given = Inputs(*(of[n] for n in ("planes", "pixels", "evidence", "place", "real", "logs")), 0.0)
+        return cls(given, of["wanted"], of["sure_error"], float(arrays["weight"]))
 
     def mirrored(self) -> "Example":
         """Return it with left and right exchanged."""
-        width = self.given.planes.shape[2]
-        row, column = self.given.pixels // width, self.given.pixels % width
-        by_kind = (self.given.features, self.given.real, self.given.logs, self.error)
-        features, real, logs, error = (x[:, _MIRRORED] for x in by_kind)
-        given = Inputs(self.given.planes.flip(2), row * width + width - 1 - column, features, real, logs, 0.0)
-        return replace(self, given=given, error=error, sure_error=self.sure_error.flip(1))
+        given, order = self.given, torch.tensor(_MIRRORED, device=self.wanted.device)
+        width = given.planes.shape[2]
+        evidence, real, logs = (x[:, order] for x in (given.evidence, given.real, given.logs))
+        pixels = given.pixels + width - 1 - 2 * (given.pixels % width)
+        turned = Inputs(given.planes.flip(2), pixels, evidence, given.place, real, logs, 0.0)
+        return replace(self, given=turned, sure_error=self.sure_error.flip(1))
 
 
 def example_arrays(case: Case, truth: Array) -> dict[str, NDArray]:
     """Return what is kept of a case and its true depth (h, w)."""
     given = inputs_of(case)
-    known = truth > 0
-    wanted = np.where(known, -np.log(np.maximum(truth, 1e-6)) - np.float32(given.reference), np.float32(0))
-    at, spoken = case.found.pixels, case.spoken
+    known, at, spoken = truth > 0, case.found.pixels, case.spoken
+    wanted = -np.log(np.maximum(truth, 1e-6)) - np.float32(given.reference)
     relative = np.log(np.maximum(spoken, 1e-9)) - np.float32(given.reference)
+    logs, of_pixel = given.logs.numpy().clip(-6, 6), np.where(known, wanted, np.float32(np.nan)).ravel()[at]
+    fill = np.abs(logs[:, 0] - of_pixel).clip(max=1)
     return {
         "planes": given.planes.numpy().astype(np.float16),
         "pixels": at.astype(np.int32),
-        "features": given.features.numpy().astype(np.float16),
+        "evidence": case.evidence,
+        "place": case.place,
         "real": given.real.numpy(),
-        "logs": given.logs.numpy().clip(-6, 6),
-        "error": (given.logs.numpy() - wanted.ravel()[at][:, None]).clip(-6, 6),
-        "known": known.ravel()[at],
+        "logs": logs.astype(np.float16),
+        "wanted": of_pixel.clip(-6, 6),
         "sure_error": np.where(known & (spoken > 0), relative - wanted, _UNKNOWN).astype(np.float16),
+        "weight": np.array(1 / (np.nanmean(fill) + 0.08)),
     }
 
 
-def _leave_examples(job: tuple[int, Path, float]) -> None:
+def _leave_examples(job: tuple[int, Path, float, str]) -> None:
     """Leave a file of each keyframe of a room, unless the time is over."""
-    seed, folder, deadline = job
-    if time.time() > deadline:
+    seed, folder, deadline, device = job
+    if time.time() > deadline or any((folder / "examples").glob(f"{seed}_*.npz")):
         return
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    for k, (case, truth) in enumerate(room_cases(seed, folder)):
-        arrays = example_arrays(case, truth)
-        if arrays["known"].sum() >= _LEAST_PIXELS // 2:
-            save_arrays(folder / "examples" / f"{seed}_{k}.npz", arrays, compress=False)
+    for k, (case, truth) in enumerate(room_cases(seed, folder, device)):
+        if (truth.ravel()[case.found.pixels] > 0).sum() >= _LEAST_PIXELS // 2:
+            save_arrays(folder / "examples" / f"{seed}_{k}.npz", example_arrays(case, truth), compress=False)
 
 
-class _Examples:
-    """The examples that are there, by size of their images; files are taken away once they are in memory."""
+class Examples:
+    """The examples that are there, by size of their images; read by threads as files come."""
 
-    def __init__(self, folder: Path, device: str) -> None:
-        self._folder, self._device = folder, device
+    def __init__(self, folder: Path, device: str, fewest: int = _FEWEST) -> None:
+        self._folder, self._device, self._known, self._lock = folder, device, set[Path](), threading.Lock()
+        self._fewest = fewest
         self.of_size: dict[tuple[int, ...], list[Example]] = {}
+        self.count, self._over = 0, threading.Event()
+        self._readers = ThreadPoolExecutor(_READERS)
+        self._reading = [self._readers.submit(self._read) for _ in range(_READERS)]
 
-    def take(self, most: int) -> None:
-        """Take up to so many more."""
-        for path in sorted(self._folder.glob("[0-9]*.npz"))[:most]:
-            if self._device == "cuda" and torch.cuda.mem_get_info()[0] < _SPARED_BYTES:
-                return
-            example = Example.of(load_arrays(path), self._device)
-            path.unlink()
-            self.of_size.setdefault(tuple(example.given.planes.shape[1:]), []).append(example)
+    def close(self) -> None:
+        """Stop reading. Raises what a reader raised."""
+        self._over.set()
+        for reader in self._reading:
+            reader.result()
+        self._readers.shutdown()
+
+    def _read(self) -> None:
+        waiting: list[Path] = []
+        while not self._over.is_set():
+            with self._lock:
+                if not waiting:
+                    there = {p for p in self._folder.glob("[0-9]*.npz") if p.stem.replace("_", "").isdigit()}
+                    waiting = sorted(there - self._known)[:20]
+                    self._known.update(waiting)
+            full = self._device == "cuda" and torch.cuda.mem_get_info()[0] < _SPARED_BYTES
+            if not waiting or full:
+                self._over.wait(1.0)
+                continue
+            example = Example.of(load_arrays(waiting.pop()), self._device)
+            with self._lock:
+                self.of_size.setdefault(tuple(example.given.planes.shape[1:]), []).append(example)
+                self.count += 1
 
     def batch(self, rng: np.random.Generator) -> list[Example]:
         """Draw examples of one size, every second one mirrored; none while there are too few."""
-        groups = [g for g in self.of_size.values() if len(g) >= _BATCH]
-        if not groups:
+        groups = [list(g) for g in list(self.of_size.values()) if len(g) >= _BATCH]
+        if not groups or self.count < self._fewest:
             return []
         counts = np.array([len(g) for g in groups], float)
         group = groups[rng.choice(len(groups), p=counts / counts.sum())]
@@ -218,23 +249,32 @@ class _Examples:
 # learning -------------------------------------------------------------------------------------------------------
 
 
-def learn(folder: Path, seeds: range, seconds: float, workers: int, start: Path | None) -> Path:
-    """Learn for so many seconds while rooms are made for the first three quarters of them; return the file of the
-    weights, as it comes with the program. From the weights of `start`, if given, by a third of the rate."""
+def learn(folder: Path, seeds: range, seconds: float, workers: int, start: Path | None, pause: float) -> Path | None:
+    """Learn for so many seconds in all, while rooms are made for the first of them; return the file of the weights, as
+    it comes with the program. From the weights of `start`, if given, by a half of the rate. Pauses after `pause`
+    seconds of this call (None), if not 0; the next call goes on with the rooms that there are."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     torch.manual_seed(0)
-    begun, target = time.time(), folder / "weights.npz"
+    target, state = folder / "weights.npz", folder / "paused.npz"
     (folder / "examples").mkdir(parents=True, exist_ok=True)
-    deadline = begun + 0.75 * seconds
-    _leave_examples((seeds[0], folder, deadline))  # furniture and kernels are ready before there are processes
-    with multiprocessing.get_context("fork").Pool(workers) as pool:
-        made = pool.imap_unordered(_leave_examples, [(s, folder, deadline) for s in seeds[1:]])
-        network = CompletionNetwork()
-        if start is not None:
-            network.load_state_dict(_tensors(start), strict=False)
-        _fit(network.to(device), _Examples(folder / "examples", device), begun, seconds, 1 / 3 if start else 1.0)
-        for _ in made:
-            pass
+    network = CompletionNetwork()
+    if start is not None:
+        network.load_state_dict(_tensors(start), strict=False)
+    with closing(Examples(folder / "examples", device)) as examples:
+        fit = Fit(network.to(device), examples, seconds, 0.5 if start else 1.0)
+        if state.exists():
+            fit.load(load_arrays(state))
+        # Each has a context of its own on the card: no copies of this process.
+        with multiprocessing.get_context("spawn").Pool(workers) as pool:
+            deadline = time.time() + _MADE_UNTIL * seconds - fit.done
+            made = pool.imap_unordered(_leave_examples, [(s, folder, deadline, device) for s in seeds])
+            is_over = fit.run(pause or math.inf)
+            for _ in made if is_over else ():
+                pass
+    if not is_over:
+        save_arrays(state, fit.state())
+        return None
+    state.unlink(missing_ok=True)
     states = {k: v.cpu().numpy() for k, v in network.state_dict().items() if not k.endswith("num_batches_tracked")}
     save_arrays(target, {k: v if "running" in k else v.astype(np.float16) for k, v in states.items()})
     return target
@@ -244,71 +284,117 @@ def _tensors(weights: Path) -> dict[str, Tensor]:
     return {k: torch.from_numpy(v.astype(np.float32)) for k, v in load_arrays(weights).items()}
 
 
-def _fit(network: CompletionNetwork, examples: _Examples, begun: float, seconds: float, slower: float) -> None:
-    optimizer = torch.optim.AdamW(network.parameters(), _RATE, weight_decay=_DECAY)
-    rng, steps, told, losses = np.random.default_rng(0), 0, begun, list[float]()
-    device = next(network.parameters()).device.type
-    while (done := (time.time() - begun) / seconds) < 1:
-        examples.take(4)
-        batch = examples.batch(rng)
-        if not batch:
-            time.sleep(0.5)
-            continue
-        rate = done / 0.04 if done < 0.04 else 0.5 * (1 + math.cos(math.pi * (done - 0.04) / 0.96))
-        for group in optimizer.param_groups:
-            group["lr"] = max(_RATE * slower * rate, 1e-6)
-        optimizer.zero_grad(set_to_none=True)
-        with torch.autocast(device, dtype=torch.bfloat16, enabled=device == "cuda"):
-            loss = _loss(network, batch)
+class Fit:
+    """A network that learns, its optimiser, and the seconds that are done."""
+
+    def __init__(self, network: CompletionNetwork, examples: Examples, seconds: float, slower: float) -> None:
+        self.network, self.done = network, 0.0
+        self._examples, self._seconds, self._rate = examples, seconds, _RATE * slower
+        self._device = next(network.parameters()).device.type
+        fused = self._device == "cuda"
+        self._optimizer = torch.optim.AdamW(network.parameters(), _RATE, weight_decay=_DECAY, fused=fused)
+
+    def state(self) -> dict[str, NDArray]:
+        """What `load` goes on from."""
+        arrays = {f"network/{k}": v.cpu().numpy() for k, v in self.network.state_dict().items()}
+        for k, values in self._optimizer.state_dict()["state"].items():
+            arrays |= {f"optimizer/{k}/{name}": v.cpu().numpy() for name, v in values.items()}
+        return {**arrays, "done": np.array(self.done)}
+
+    def load(self, arrays: dict[str, NDArray]) -> None:
+        """Go on from what `state` gave."""
+        self.done = float(arrays["done"])
+        of = {k: torch.from_numpy(np.array(v)) for k, v in arrays.items()}
+        self.network.load_state_dict({k.removeprefix("network/"): v for k, v in of.items() if k.startswith("network/")})
+        moments: dict[int, dict[str, Tensor]] = {}
+        for key in (k for k in of if k.startswith("optimizer/")):
+            _, number, name = key.split("/")
+            moments.setdefault(int(number), {})[name] = of[key]
+        self._optimizer.load_state_dict({**self._optimizer.state_dict(), "state": moments})
+
+    def run(self, most: float) -> bool:
+        """Learn until the time is over (True), or for at most so many seconds."""
+        begun, before, rng = time.time(), self.done, np.random.default_rng(int(self.done))
+        steps, told, losses = 0, begun, list[float]()
+        while self.done < self._seconds:
+            self.done = before + time.time() - begun
+            if self.done - before > most:
+                return False
+            batch = self._examples.batch(rng)
+            if not batch:
+                time.sleep(0.5)
+                continue
+            loss = self._step(batch)
+            steps += 1
+            losses += [float(loss)] if steps % 20 == 1 else []
+            if time.time() - told > 30:
+                told, count = time.time(), self._examples.count
+                recent = np.mean(losses[-30:])
+                print(f"{self.done:.0f} s, {steps} steps, {count} keyframes, loss {recent:.3f}", flush=True)
+        return True
+
+    def _step(self, batch: list[Example]) -> Tensor:
+        part = self.done / self._seconds
+        rate = part / 0.04 if part < 0.04 else 0.5 * (1 + math.cos(math.pi * (part - 0.04) / 0.96))
+        for group in self._optimizer.param_groups:
+            group["lr"] = max(self._rate * rate, 1e-6)
+        self._optimizer.zero_grad(set_to_none=True)
+        with torch.autocast(self._device, dtype=torch.bfloat16, enabled=self._device == "cuda"):
+            loss = loss_of(self.network, batch)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimizer.step()
-        steps += 1
-        losses += [float(loss.detach())] if steps % 10 == 1 else []
-        if time.time() - told > 30:
-            told, count = time.time(), sum(map(len, examples.of_size.values()))
-            recent = np.mean(losses[-30:]) if losses else math.nan
-            print(f"{told - begun:.0f} s, {steps} steps, {count} keyframes, loss {recent:.3f}", flush=True)
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self._optimizer.step()
+        return loss.detach()
 
 
-def _loss(network: CompletionNetwork, batch: list[Example]) -> Tensor:
+def loss_of(network: CompletionNetwork, batch: list[Example]) -> Tensor:
     """Negative log likelihood of the truth and expected error, and likelihood of the error of what is sure."""
-    real = torch.cat([e.given.real for e in batch])
-    features = _partly_hidden(torch.cat([e.given.features for e in batch]).float(), [len(e.known) for e in batch])
-    hidden = network.read(features, real)
+    counts, area, device = [len(e.wanted) for e in batch], batch[0].given.planes[0].numel(), batch[0].wanted.device
+    of_frame = torch.repeat_interleave(
+        torch.arange(len(batch), device=device), torch.tensor(counts, device=device), output_size=sum(counts)
+    )
+    joined = {n: torch.cat([getattr(e.given, n) for e in batch]) for n in ("evidence", "place", "real", "logs")}
+    real, logs = joined["real"], joined["logs"].float()
+    wanted, pixels = torch.cat([e.wanted for e in batch]), torch.cat([e.given.pixels for e in batch]).long()
+    known, at = ~wanted.isnan(), pixels + of_frame * area
+    evidence, place = (numbers_of(joined[n]) for n in ("evidence", "place"))
+    numbers = [_partly_hidden(x, of_frame, len(batch)) for x in (evidence, place, compare(logs, real))]
+    hidden = network.read(*numbers, real)
     gathered = network.gather(hidden, real)
-    counts, pixels = [len(e.known) for e in batch], [e.given.pixels.long() for e in batch]
-    planes = torch.stack([_recolored(e.given.planes.float()) for e in batch])
-    around = network.look_around(planes, pixels, list(gathered.split(counts)))
-    context = torch.cat([a[:-1].flatten(1)[:, at].T for a, at in zip(around, pixels, strict=True)])
-    share, moved, log_spread = network.weigh(hidden, real, gathered, context)
-    error = torch.cat([e.error for e in batch]).float()
+    planes = _recolored(torch.stack([e.given.planes for e in batch]).float())
+    around = network.look_around(planes.contiguous(memory_format=torch.channels_last), at, gathered)
+    share, moved, log_spread = network.weigh(hidden, real, gathered, around[..., :-1].flatten(0, 2)[at])
+    error = logs - torch.where(known, wanted, 0)[:, None]
     apart = (torch.cat([error, error[:, :1]], 1) + moved).abs()
     counted = torch.tensor([e.weight for e in batch])
-    counted = (counted / counted.mean()).clamp(max=3).repeat_interleave(torch.tensor(counts)).to(apart.device)
-    counted = counted * torch.cat([e.known for e in batch])
+    counted = (counted / counted.mean()).clamp(max=3).to(device)[of_frame] * known
     unlikely = -torch.logsumexp(share - apart.clamp(max=2) / log_spread.exp() - log_spread, 1)
     expected = (share.exp() * apart.clamp(max=1)).sum(1)
     total = (counted * (unlikely + _RISK * expected)).sum() / counted.sum().clamp(min=1)
-    off, log_doubt = torch.stack([e.sure_error for e in batch]).float(), around[:, -1].float().clamp(-5.8, 0)
-    there = off < _UNKNOWN / 2
-    return total + _DOUBT * (off.abs().clamp(max=0.5) / log_doubt.exp() + log_doubt)[there].mean()
+    off, log_doubt = torch.stack([e.sure_error for e in batch]).float(), around[..., -1].float().clamp(-5.8, 0)
+    there = (off < _UNKNOWN / 2).float()
+    unlikely = off.abs().clamp(max=0.5) / log_doubt.exp() + log_doubt
+    return total + _DOUBT * (unlikely * there).sum() / there.sum().clamp(min=1)
 
 
-def _partly_hidden(features: Tensor, counts: list[int]) -> Tensor:
-    """Take kinds of evidence away, at random from a keyframe as a whole and from single pixels."""
-    device, kinds, half = features.device, features.shape[-1], _HIDDEN / 2
-    of_frame = (torch.rand(len(counts), kinds, device=device) > half).float()
-    of_frame = of_frame.repeat_interleave(torch.tensor(counts, device=device), 0)
-    return features * of_frame[:, None] * (torch.rand(len(features), 1, kinds, device=device) > half)
+def _partly_hidden(numbers: Tensor, of_frame: Tensor, frames: int) -> Tensor:
+    """Take kinds of evidence (P, ..., kinds) away, at random from a keyframe as a whole and from single pixels."""
+    device, kinds, half = numbers.device, numbers.shape[-1], _HIDDEN / 2
+    shown = (torch.rand(frames, kinds, device=device) > half)[of_frame]
+    shown = shown & (torch.rand(len(numbers), kinds, device=device) > half)
+    return numbers * (shown[:, None] if numbers.ndim == 3 else shown)
 
 
 def _recolored(planes: Tensor) -> Tensor:
-    """Change lightness, colour, noise and contrast of an image's planes (10, h, w)."""
-    device, by = planes.device, _RECOLORED
-    lightness = planes[:1] * (1 + by * torch.randn(1, device=device)) + 0.5 * by * torch.randn(1, device=device)
-    gain = (1 + 2 * by * torch.randn(2, 1, 1, device=device)).clamp(min=0)
-    colors = torch.cat([lightness, planes[1:3] * gain + 0.5 * by * torch.randn(2, 1, 1, device=device)])
-    colors = colors + 0.15 * by * torch.rand(1, device=device) * torch.randn_like(colors)
-    contrast = planes[9:] + 0.3 * by * torch.randn(1, device=device)
-    return torch.cat([colors * (torch.rand(1, device=device) >= _COLORLESS), planes[3:9], contrast])
+    """Change lightness, colour, noise and contrast of images' planes (B, 10, h, w)."""
+    by = _RECOLORED
+
+    def draw(channels: int) -> Tensor:
+        return torch.randn(len(planes), channels, 1, 1, device=planes.device)
+
+    lightness = planes[:, :1] * (1 + by * draw(1)) + 0.5 * by * draw(1)
+    colors = torch.cat([lightness, planes[:, 1:3] * (1 + 2 * by * draw(2)).clamp(min=0) + 0.5 * by * draw(2)], 1)
+    colors = colors + 0.15 * by * draw(1).abs() * torch.randn_like(colors)
+    contrast = planes[:, 9:] + 0.3 * by * draw(1)
+    colored = torch.rand(len(planes), 1, 1, 1, device=planes.device) >= _COLORLESS
+    return torch.cat([colors * colored, planes[:, 3:9], contrast], 1)

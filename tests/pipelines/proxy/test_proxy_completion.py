@@ -1,18 +1,30 @@
-"""Completion of a keyframe's depth: planes along like colours, what others lend, the network that weighs it."""
+"""Completion of a keyframe's depth: planes along like colours, what others lend, the network that weighs it and how it
+learns."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 
+from msgs_slam.formats.tensors import load_arrays, save_arrays
 from msgs_slam.pipelines.depth.completion import network as rooms_network
 from msgs_slam.pipelines.depth.completion.candidates import KINDS, Half
-from msgs_slam.pipelines.depth.completion.evidence import Case, ask_again, gather_case
+from msgs_slam.pipelines.depth.completion.evidence import STEP_OF_NUMBERS, Case, ask_again, gather_case
 from msgs_slam.pipelines.depth.completion.fill import SURE, agreed_depth, carry_depth, local_planes, smooth_confidence
 from msgs_slam.pipelines.depth.completion.keyframe import HALF, TWICE, as_completed, complete, halved, trusted
-from msgs_slam.pipelines.depth.completion.network import Mixture, inputs_of, load_network, middle_of
+from msgs_slam.pipelines.depth.completion.network import (
+    CompletionNetwork,
+    Mixture,
+    inputs_of,
+    load_network,
+    middle_of,
+    numbers_of,
+)
 from msgs_slam.pipelines.depth.stereo.sweep import warps_to
 from msgs_slam.pipelines.depth.stereo.window import surface_contrast
+from tests.benchmarks.rooms.learning import Example, Examples, Fit, example_arrays, loss_of
 
 HEIGHT, WIDTH, FOCAL = 40, 60, 50.0
 MATRIX = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
@@ -173,10 +185,10 @@ def test_keyframes_are_asked_again_once_they_are_completed() -> None:
     assert (known.confidence[other.own.confidence < SURE] < SURE).all()
     again = ask_again(case, [known], back)
     np.testing.assert_array_equal(again.evidence[..., :3], case.evidence[..., :3])
-    np.testing.assert_array_equal(again.evidence[..., 13:], case.evidence[..., 13:])
+    assert again.place is case.place
     weakly_on = 6  # how many views have it there, unsurely
-    assert again.evidence[:, 0, weakly_on].mean() > case.evidence[:, 0, weakly_on].mean() + 0.3
-    assert ask_again(case, [], []) is case
+    assert again.evidence[:, 0, weakly_on].mean() > case.evidence[:, 0, weakly_on].mean() + 0.3 / STEP_OF_NUMBERS
+    assert (numbers_of(torch.from_numpy(ask_again(case, [], []).evidence[..., 3:])) == 0).all()
 
 
 def test_with_hardly_any_sure_pixel_there_is_nothing_to_complete_from() -> None:
@@ -228,3 +240,54 @@ def test_the_network_knows_no_unit_of_depth() -> None:
     assert distant is not None
     for ours, theirs in zip(complete(near, "cpu"), complete(distant, "cpu"), strict=True):
         assert np.median(np.abs(theirs / ours - theirs.mean() / ours.mean())) < 0.01
+
+
+# learning -------------------------------------------------------------------------------------------------------
+
+
+def wall_arrays() -> dict[str, NDArray]:
+    truth = plane_depth(MIDDLE).reshape(HEIGHT // 2, 2, WIDTH // 2, 2).mean((1, 3)).astype(np.float32)
+    return example_arrays(wall_case(), truth)
+
+
+def test_a_mirrored_example_is_as_likely_as_its_mirror_image() -> None:
+    example = Example.of(wall_arrays(), "cpu")
+    twice = example.mirrored().mirrored()
+    for name, values in vars(example.given).items():
+        assert torch.equal(torch.as_tensor(getattr(twice.given, name)), torch.as_tensor(values)), name
+    assert torch.equal(twice.sure_error, example.sure_error)
+    width, mirrored = example.given.planes.shape[2], example.mirrored().given
+    columns = example.given.pixels % width + mirrored.pixels % width
+    assert (columns == width - 1).all()
+
+
+def test_the_truth_becomes_likelier_with_each_step() -> None:
+    torch.manual_seed(0)
+    network, batch = CompletionNetwork(), [Example.of(wall_arrays(), "cpu")] * 2
+    optimizer = torch.optim.AdamW(network.parameters(), 3e-3)
+    losses = []
+    for _ in range(12):
+        optimizer.zero_grad()
+        loss = loss_of(network, batch)
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert np.mean(losses[-3:]) < np.mean(losses[:3]) - 0.4
+
+
+def test_learning_goes_on_after_a_pause(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    for k in range(8):
+        save_arrays(tmp_path / f"3_{k}.npz", wall_arrays(), compress=False)
+    examples = Examples(tmp_path, "cpu", fewest=8)
+    try:
+        first = Fit(CompletionNetwork(), examples, 60.0, 1.0)
+        assert not first.run(2.0)
+        save_arrays(tmp_path / "paused.npz", first.state())
+        again = Fit(CompletionNetwork(), examples, first.done + 1.0, 1.0)
+        again.load(load_arrays(tmp_path / "paused.npz"))
+        for name, values in again.state().items():
+            np.testing.assert_array_equal(values, first.state()[name], err_msg=name)
+        assert again.run(np.inf)
+    finally:
+        examples.close()
