@@ -13,7 +13,8 @@ A default about depth is chosen on `choose` and reported on `judge`. A room is a
 walk of 12 keyframes, a camera; 15 CPU seconds each. Needs `pip install embreex`. Poses are those of the walk up to a
 millimetre. "off": wrong by more than 5 %; "unsure": confidence below 0.3 in OLD. `video` takes the kinds of rooms in
 turn; each is a walk of twelve seconds at 640x480 (40 CPU seconds), for `reconstruct DIR/video/SEED/video.mp4` and
-`evaluate --truth DIR/video/SEED --class-map tests/benchmarks/rooms/classes.toml`.
+`evaluate --truth DIR/video/SEED --class-map tests/benchmarks/rooms/classes.toml`. `learn` leaves DIR/weights.npz; with
+--pause it leaves what the same command goes on from, where a machine is not lent for long enough.
 """
 
 import argparse
