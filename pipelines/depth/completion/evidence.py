@@ -14,9 +14,9 @@ Bytes = NDArray[np.uint8]
 OF_CANDIDATE, OF_PLACE = 13, 6
 FEATURES = OF_CANDIDATE + OF_PLACE
 """Numbers that are known of each candidate of a pixel, and of the pixel."""
-LEAST_NUMBER, STEP_OF_NUMBERS = -0.75, 0.75 / 68
-"""They are kept as bytes: the value of 0, and what one more is worth."""
-_NOTHING = 68
+LEAST_NUMBER, _NOTHING = -0.75, 68
+STEP_OF_NUMBERS = -LEAST_NUMBER / _NOTHING
+"""They are kept as bytes: the value of 0, the byte that stands for a value of 0, and what one more is worth."""
 _SAME = np.float32(0.004)
 """Candidates whose depths differ by less, relatively, are asked about once."""
 LENDERS, ASKED = 16, 6
@@ -74,8 +74,8 @@ def gather_case(
 
 
 def ask_again(case: Case, views: list[Half], warps: list[NDArray[np.float64]]) -> Case:
-    """Return the case with what the views say of its candidates; warps (3, 4) lead from the keyframe's pixels to
-    theirs. What it was without views says nothing."""
+    """Return the case with what the views say of its candidates, nothing where there are none; warps (3, 4) lead from
+    the keyframe's pixels to theirs."""
     evidence, own = case.evidence.copy(), case.own
     if views:
         _ask_views(case.found.pixels, case.found.inverse, own.lab, *_stacked(views), np.stack(warps), evidence)

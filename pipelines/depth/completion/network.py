@@ -218,7 +218,6 @@ _ONE_AT_A_TIME = Lock()
 """Held while the network runs: it has threads of its own, and those of two callers can wait for each other."""
 
 
-@torch.no_grad()
 def weigh_candidates(given: Inputs, device: str) -> Mixture:
     """Weigh the candidates of one keyframe by the network that comes with the program."""
     with _ONE_AT_A_TIME:

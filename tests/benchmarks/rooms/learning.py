@@ -189,7 +189,7 @@ def example_arrays(case: Case, truth: Array) -> dict[str, NDArray]:
 
 
 def _leave_examples(job: tuple[int, Path, float, str]) -> None:
-    """Leave a file of each keyframe of a room, unless the time is over."""
+    """Leave a file of each keyframe of a room, unless the time is over or an earlier call left some."""
     seed, folder, deadline, device = job
     if time.time() > deadline or any((folder / "examples").glob(f"{seed}_*.npz")):
         return
