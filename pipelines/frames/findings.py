@@ -14,6 +14,7 @@ from ..geometry.sparse_model import SparseModel
 from ..run.extension import ParentRun
 from ..sfm.adjust import focals_of_halves
 from ..sfm.candidates import GIVEN, GIVEN_ALONE
+from ..sfm.drift import MAX_DRIFT
 from ..sfm.driver import Structure
 from ..sfm.given import agreement
 from ..sfm.lens import Lens
@@ -115,7 +116,13 @@ def warn_of_structure(context: StageContext, structure: Structure, ids: list[int
             f"the camera's path may be folded between frames {folds}, where neighbouring images contradict it: "
             f"{agreeing}"
         )
-    elif report.pairs_agreeing < 0.9:
+    if report.drift.factor >= MAX_DRIFT:
+        context.warn(
+            f"the scale of the camera's path changes by a factor of {report.drift.factor:.2g} or more between frames "
+            f"{ids[report.drift.first]} and {ids[report.drift.last]}: what is near either end is measured in another "
+            "unit. Poses there are not to be relied on"
+        )
+    if not folds and report.pairs_agreeing < 0.9:
         context.warn(
             f"images taken far apart contradict the camera's path: {agreeing}. Either repeated structures were "
             "confused, which is harmless, or a loop is not closed"

@@ -42,7 +42,11 @@ def check_frames(source: Path, config: Config) -> None:
 
     check_masks(source, config)
     open_learned(config.frames)
-    read_readout(config.frames.rolling_shutter)
+    if any(read_readout(config.frames.rolling_shutter) or ()) and not opened.has_times:
+        raise InputError(
+            f"frames.rolling_shutter={config.frames.rolling_shutter} needs to know when each image was taken, and "
+            f"{source} does not tell: give the video itself, or put the times in {source.name}/times.txt"
+        )
     faces = find_faces(opened, config.frames)
     if faces is None and config.frames.intrinsics:
         read_intrinsics(config.frames.intrinsics, opened.width, opened.height)

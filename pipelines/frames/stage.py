@@ -58,7 +58,9 @@ def run(context: StageContext) -> dict[str, Any]:
     try:
         keyframes = _keyframes(context, frames, masks, rig)
         masks.find_people(frames, keyframes, context.progress)
-        structure, origin = _structure(context, (camera, origin), frames, keyframes, masks, rig, given)
+        structure, origin = _structure(
+            context, (camera, origin), frames, keyframes, masks, rig, given, source.has_times
+        )
     except InputError as error:
         if blame := masks.blame(frames, camera.width, camera.height):
             raise InputError(blame) from error
@@ -143,6 +145,7 @@ def _structure(
     masks: FrameMasks,
     rig: Rig,
     given: GivenPoses | None,
+    has_times: bool,
 ) -> tuple[Structure, str]:
     """The structure, and the origin of its camera."""
 
@@ -150,7 +153,7 @@ def _structure(
         if count:
             in_chunks(context, TASKS[name], count, motion, frames=frames, keyframes=keyframes, **known)
 
-    motion = structure_from_motion(context, *camera, frames, masks, rig, given, divide)
+    motion = structure_from_motion(context, *camera, frames, masks, rig, given, has_times, divide)
     structure, origin = solve(context, motion, camera[1], keyframes)
     warn_of_structure(context, structure, [frames[k].id for k in keyframes])
     return structure, origin
@@ -245,6 +248,7 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
         "pairs_agreeing": round(report.pairs_agreeing, 4),
         "parts": len(report.parts),
         "contradicted_seams": len(report.contradicted),
+        "scale_drift": round(report.drift.factor, 3),
         "mapper": structure.mapper,
         "calibration": calibration.origin,
         "focal_px": round(calibration.intrinsics.fx, 3),

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 
+import numpy as np
 import pycolmap
 
 from ...formats.datasets.sequence import Camera
@@ -15,6 +16,7 @@ from ..run.extension import parent_of
 from ..sfm.driver import Divide, StructureFromMotion, no_prefetch
 from ..sfm.lens import FOCAL_GUESS, calibrated_camera, to_pycolmap, unknown_camera
 from ..sfm.matching import match_features
+from ..sfm.rolling import frame_interval
 from ..sfm.snapshots import Snapshots
 from ..source.faces import Faces, find_faces
 from ..source.given import given_poses, read_intrinsics
@@ -61,9 +63,10 @@ def structure_from_motion(
     masks: FrameMasks,
     rig: Rig,
     given: GivenPoses | None,
+    has_times: bool,
     divide: Divide = no_prefetch,
 ) -> StructureFromMotion:
-    """Prepare structure from motion of these frames; `origin` is as in `known_camera`."""
+    """Prepare structure from motion of these frames; `origin` is as in `known_camera`, `has_times` as of a source."""
     settings, size = context.config.frames, (camera.width, camera.height)
     learned, before = open_learned(settings), parent_of(context.source)
     start = given.cam_from_world if given is not None else None
@@ -79,6 +82,7 @@ def structure_from_motion(
         is_stated=origin == "stated",
         given=start if before is None else before.poses_of(frames),
         is_extension=before is not None,
+        frame_interval=_interval(frames) if has_times else 0.0,
         extract=extract,
         picture=lambda frame_id: grey_of(context, masks, frames[frame_id]),
         time=lambda frame_id: frames[frame_id].timestamp,
@@ -95,6 +99,10 @@ def structure_from_motion(
     )
 
 
+def _interval(frames: list[Frame]) -> float:
+    return frame_interval(np.array([f.timestamp for f in frames]), np.array([f.source_index for f in frames]))
+
+
 # tasks ----------------------------------------------------------------------------------------------------------
 
 
@@ -108,7 +116,7 @@ def _opened(task: Chunk, progress: Progress) -> StructureFromMotion:
     rig = rig_of(1 if faces is None else len(faces), len(frames))
     masks = masks_of(context, source, faces, rig)
     given = given_poses(context.config.frames, source, frames)
-    return structure_from_motion(context, camera, origin, frames, masks, rig, given)
+    return structure_from_motion(context, camera, origin, frames, masks, rig, given, source.has_times)
 
 
 def _proposed(task: Chunk) -> list[tuple[int, int]]:

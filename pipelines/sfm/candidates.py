@@ -110,7 +110,9 @@ class Candidates:
     """Inputs of candidate models besides the keyframes: `camera` is the prior, `is_fixed` holds it, `is_stated` holds
     it unless the images contradict it; `asks_pairs`: the focal length that pairs tell, not COLMAP's guess, is where
     calibration starts. `is_extension`: the given poses are those of a finished run that images were
-    added to, and are tried first. cam_from_rig (C, 3, 3): keyframes are ordered direction by direction, as in `Rig`."""
+    added to, and are tried first. `frame_interval`: seconds from one image of the source to the next, 0 where its times
+    are unknown; no readout is longer. cam_from_rig (C, 3, 3): keyframes are ordered direction by direction, as in
+    `Rig`."""
 
     config: FramesConfig
     camera: pycolmap.Camera
@@ -121,6 +123,7 @@ class Candidates:
     is_stated: bool = False
     asks_pairs: bool = True
     is_extension: bool = False
+    frame_interval: float = 0.0
     cam_from_rig: NDArray[np.float64] = field(default_factory=lambda: ONE_CAMERA.cam_from_rig)
 
     def _calibrated(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
@@ -166,11 +169,18 @@ class Candidates:
         if found is None:
             return None
         model, mapper, report = found
-        readout = NO_READOUT if len(self.cam_from_rig) > 1 else read_readout(self.config.rolling_shutter)
-        rolling = adjust_rolling(model, views.xy, views.times, readout, not self.is_fixed, bool(views.weak))
+        rolling = adjust_rolling(
+            model, views.xy, views.times, self._readout(), not self.is_fixed, bool(views.weak), self.frame_interval
+        )
         if rolling is not None:
             return Adjusted(rolling[0], mapper, rolling[2], report.score, rolling[1])
         return Adjusted(model, mapper, adjust(model, not self.is_fixed, bool(views.weak)), report.score, NO_READOUT)
+
+    def _readout(self) -> Readout | None:
+        """The readout to adjust with, None for one to be found: of panoramas and of images without times there is none
+        to find."""
+        given = read_readout(self.config.rolling_shutter)
+        return NO_READOUT if len(self.cam_from_rig) > 1 or (given is None and not self.frame_interval) else given
 
     def _map(
         self, views: KeyframeSet, pairs: Sequence[VerifiedPair], mappers: Sequence[str] = ("global", "incremental")

@@ -9,6 +9,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from .adjust import median_error, reprojection_errors, solve
+from .drift import MAX_DRIFT, NO_DRIFT, ScaleDrift, scale_drift
 from .lens import distortion_of
 from .matching import VerifiedPair
 from .seams import (
@@ -41,7 +42,8 @@ class ModelReport:
     `agreement`: share of the verified matches between registered keyframes that are within 4 px of the epipolar line
     of the final poses; `pairs_agreeing`: share of the pairs of which more than half of the matches do. A folded
     trajectory leaves whole pairs that disagree, however small its reprojection error is. `seams` and `parts`: see
-    `find_seams` and `find_parts`; they see one bad place among many good ones.
+    `find_seams` and `find_parts`; they see one bad place among many good ones. `drift`: see `scale_drift`; no pair of
+    views contradicts a path whose scale changes along it.
     """
 
     registered: int
@@ -52,6 +54,7 @@ class ModelReport:
     pairs_agreeing: float
     seams: tuple[Seam, ...]
     parts: tuple[tuple[int, ...], ...]
+    drift: ScaleDrift = NO_DRIFT
 
     @property
     def largest(self) -> tuple[int, ...]:
@@ -68,7 +71,7 @@ class ModelReport:
         """To choose between models of the same matches: larger is better."""
         cuts = [s.after for s in self.contradicted]
         runs = [sum(1 for k in self.largest if a <= k < b) for a, b in pairwise([0, *cuts, self.total])]
-        return max(runs) / self.total * self.agreement * self.pairs_agreeing
+        return max(runs) / self.total * self.agreement * self.pairs_agreeing / self.drift.factor
 
     @property
     def is_whole(self) -> bool:
@@ -83,7 +86,7 @@ class ModelReport:
     @property
     def is_consistent(self) -> bool:
         """Whether what is placed agrees with the images."""
-        return self.pairs_agreeing >= 0.9 and not self.contradicted
+        return self.pairs_agreeing >= 0.9 and not self.contradicted and self.drift.factor < MAX_DRIFT
 
 
 def judge(
@@ -106,7 +109,7 @@ def judge(
     return ModelReport(
         len(placed), total, model.num_points3D(), median_error(model),
         agreeing / max(matches, 1), sum(c.agrees for c in checks) / max(len(checks), 1),
-        tuple(seams), tuple(map(tuple, parts)),
+        tuple(seams), tuple(map(tuple, parts)), scale_drift(model, pairs, xy, total, reach),
     )  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from ..types import Features, Vocabulary
 from .adjust import adjust
 from .candidates import GIVEN_ALONE, Adjusted, Candidates, KeyframeSet
 from .consistency import ModelReport, judge
+from .drift import scale_drift
 from .flow import Picture, weakly_connected, with_bridges
 from .given import bare_model, set_best_focal
 from .lens import set_lens
@@ -34,7 +35,7 @@ from .retrieval import (
     loop_pairs,
     sequential_pairs,
 )
-from .rolling import NO_READOUT, Readout, RollingModel, adjust_rolling, read_readout
+from .rolling import NO_READOUT, Readout, RollingModel, adjust_rolling, read_readout, rectified_features
 from .seams import cut, remove_keyframes
 from .snapshots import Snapshots, features_name, pairs_name
 from .windows import WindowModels, adjust_joined
@@ -113,6 +114,9 @@ class StructureFromMotion(Candidates):
             raise InputError(why_no_structure(len(features), pairs))
         found, pieces = self._largest_first(found, self._pieces(views, pairs, found.model, apart), views)
         report, loose = self._in_parts(found.model, views, pairs)
+        straight = rectified_features(found.model, views.xy, views.times, found.readout)
+        drift = scale_drift(found.model, pairs, straight, self._places(views.xy), self.config.overlap)
+        report = replace(report, drift=drift)
         return Structure(
             found.model, report, found.mapper, found.focal_sd, features, vocabulary, tried, pairs, pieces,
             found.readout, loose,

@@ -21,7 +21,7 @@ from ..geometry import se3
 from ..types import Array, Intrinsics
 from . import bundle_kernels as kernels
 from .adjust import LOSS_SD, adjust, solve
-from .bundle import Bundle, Problem
+from .bundle import Bundle, Problem, adjust_bundle
 
 Readout = tuple[float, float]
 """Seconds by which the right and the lower border of a frame are taken later than the left and the upper one. Sensors
@@ -36,6 +36,13 @@ MIN_GAIN = 0.01
 """Share of the robust cost that a readout must explain. Of three cameras that take all rows at once it was less than
 0.00002, of a phone that holds still 0.001; of a Kinect 0.03 at first and 0.054 in the end."""
 REACH = (-2, -1, 1, 2)
+MIN_HELD_OUT_GAIN, MAX_SCALE_CHANGE = 0.02, 2.0
+"""Of the robust cost of observations held out, the share that a readout must explain; and the factor by which it may
+change the scale of one stretch of the path against another. Seven recordings of rolling shutters: 0.07 to 0.23, and
+1.01 to 1.05, but 1.54 where the camera hardly does more than turn."""
+_LONG_TRACK = 4
+"""Views of a point from which on an observation of it may be held out."""
+_FARTHEST_PX = 100.0
 _ROUNDS = 3
 """Of readout and rough adjustment by turns; the last adjustment comes after them."""
 
@@ -198,13 +205,86 @@ def straight_copy(
     return rolling.model
 
 
+def frame_interval(times: Array, numbers: NDArray[np.int64]) -> float:
+    """Estimate the seconds from one image of the source to the next, from times (N,) of the images of these `numbers`
+    (N,); 0 where they tell none."""
+    steps, apart = np.diff(numbers), np.diff(times)
+    known = (steps > 0) & (apart > 0)
+    return float(np.median(apart[known] / steps[known])) if known.any() else 0.0
+
+
+@dataclass(frozen=True)
+class ReadoutEvidence:
+    """What speaks for a readout: by what share of the robust cost of held-out observations it is better than a global
+    shutter, and by what factor it changes the scale of one stretch of the path against another."""
+
+    held_out_gain: float
+    scale_change: float
+
+    @property
+    def is_convincing(self) -> bool:
+        """Whether the observations are explained better by a path that is not bent."""
+        return self.held_out_gain > MIN_HELD_OUT_GAIN and self.scale_change < MAX_SCALE_CHANGE
+
+
+def weigh_readout(rolling: RollingModel, readout: Readout) -> ReadoutEvidence:
+    """Adjust poses and points with this readout and with none to the same observations, and compare both.
+
+    One observation of each second long track is held out of both adjustments.
+    """
+    bundle, xy, pinhole = rolling.bundle()
+    held = _held_out(bundle)
+    costs, depths = [], []
+    for tried in (NO_READOUT, readout):
+        found = bundle
+        for _ in range(_ROUNDS - 1 if any(tried) else 1):
+            velocity = velocities(found.cam_from_world, rolling.times)
+            found = rectified_bundle(found, xy, pinhole, velocity, tried)
+            adjusted = adjust_bundle(found.select(~held), pinhole).bundle
+            found = replace(found, cam_from_world=adjusted.cam_from_world, points=adjusted.points)
+        velocity = velocities(found.cam_from_world, rolling.times)
+        errors = rectified_bundle(found, xy, pinhole, velocity, tried).select(held).reprojection_errors(pinhole)
+        costs.append(float(np.log1p(np.minimum(np.nan_to_num(errors, nan=np.inf), _FARTHEST_PX) ** 2).mean()))
+        depths.append(np.maximum(found.points_in_cam()[:, 2], 1e-9))
+    change = np.log(depths[1] / depths[0])
+    by_camera = np.array([np.median(change[bundle.obs_cam == c]) for c in np.unique(bundle.obs_cam)])
+    low, high = np.percentile(by_camera, (2, 98))
+    return ReadoutEvidence(1 - costs[1] / max(costs[0], 1e-12), math.exp(high - low))
+
+
+def _held_out(bundle: Bundle) -> NDArray[np.bool_]:
+    """(O,) one observation, in turn an early and a late one, of each second point that many cameras see."""
+    order = np.lexsort((bundle.obs_cam, bundle.obs_point))
+    points, first, length = np.unique(bundle.obs_point[order], return_index=True, return_counts=True)
+    chosen = (length >= _LONG_TRACK) & (points % 2 == 0)
+    held = np.zeros(len(order), np.bool_)
+    held[order[(first + points // 2 % length)[chosen]]] = True
+    return held
+
+
+def rectified_features(
+    model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout
+) -> Sequence[Array]:
+    """Pixels (F, 2) of each keyframe's features where they would be in frames taken at once; NaN for those whose depth
+    no point of the model tells."""
+    if not any(readout):
+        return xy
+    rolling = RollingModel(pycolmap.Reconstruction(model), xy, times)
+    rolling.rectify_observations(*rolling.bundle(), readout)
+    out = [np.full(pixels.shape, np.nan) for pixels in xy]
+    for i, features, own in zip(rolling.images, rolling.features, rolling.arrays.rows(), strict=True):
+        out[i - 1][features] = rolling.now[own]
+    return out
+
+
 def adjust_rolling(
     model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout | None, refine_camera: bool,
-    narrowly: bool = False,
+    narrowly: bool = False, longest: float = LONGEST_STEP,
 ) -> tuple[pycolmap.Reconstruction, Readout, float] | None:  # fmt: skip
     """The model adjusted with the `readout` given, or found where it is None, and the standard deviation of its focal
-    length; None where there is no readout, or where the one found explains too little. The model given stays as it is,
-    and pixels are those in the frames before and after."""
+    length; None where there is no readout, or where the one found is longer than the `longest` possible (seconds),
+    explains too little, or bends the path. The model given stays as it is, and pixels are those in the frames before
+    and after."""
     if readout is not None and not any(readout):
         return None
     rolling = RollingModel(pycolmap.Reconstruction(model), xy, times)
@@ -226,7 +306,12 @@ def adjust_rolling(
         if readout is None:
             step, share = estimate(*seen, rolling.times, axis)
             seconds += step
-    if readout is None and seconds**2 * share < MIN_GAIN:
+    if readout is None:
+        ev = weigh_readout(rolling, (axis[0] * seconds, axis[1] * seconds))
+        print("READOUT", seconds, longest, seconds**2 * share, ev, flush=True)
+    if readout is None and (seconds**2 * share < MIN_GAIN or abs(seconds) > longest):
+        return None
+    if readout is None and not ev.is_convincing:
         return None
     found = axis[0] * seconds, axis[1] * seconds
     rolling.rectify_observations(*seen, found)

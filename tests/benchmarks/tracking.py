@@ -37,6 +37,7 @@ import numpy as np
 from hard_sequences import HARD, write_hard, write_noisy_depth
 from numpy.typing import NDArray
 from parted_sequences import LONG, PARTED, kitchen_two_row, write_parted
+from PIL import Image
 
 DATA = ROOT.parent / "shared" / "data"
 PLAIN = ("run.format=images",)
@@ -69,6 +70,8 @@ class Case:
     truth: Truth
     glob: str = "*"
     last: int = 0
+    rate: float = 0.0
+    """Images a second, of which a video is made; 0 for none."""
 
 
 def rows_of(path: Path) -> NDArray[np.float64]:
@@ -169,6 +172,8 @@ def prepare(name: str, case: Case, work: Path) -> Path:
         return write_hard(name, work / name, DATA)
     if name in PARTED:
         return write_parted(name, work / name, DATA)
+    if case.rate:
+        return write_video(work / f"{name}.mp4", case.source, case.rate)
     if case.glob == "*" and not case.last:
         return case.source
     folder = work / f"{name}_pictures"
@@ -178,6 +183,27 @@ def prepare(name: str, case: Case, work: Path) -> Path:
         if not (folder / picture.name).exists():
             shutil.copy(picture, folder / picture.name)
     return folder
+
+
+def write_video(path: Path, pictures: Path, rate: float) -> Path:
+    """The pictures of a folder as an H.264 video of that rate."""
+    from fractions import Fraction
+
+    import av
+
+    if not path.exists():
+        partial = path.with_suffix(".partial.mp4")
+        with av.open(str(partial), "w") as container:
+            stream = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))
+            stream.options = {"crf": "17", "preset": "fast", "threads": "1"}
+            stream.pix_fmt = "yuv420p"
+            images = [Image.open(p).convert("RGB") for p in sorted(pictures.iterdir())]
+            stream.width, stream.height = images[0].size
+            for image in images:
+                container.mux(stream.encode(av.VideoFrame.from_image(image)))
+            container.mux(stream.encode())
+        partial.replace(path)
+    return path
 
 
 def write_walk(folder: Path, layout: str, texel: float = 0.006, **options: Any) -> Path:
@@ -320,7 +346,23 @@ def errors(
 
 
 def measure_colmap(name: str, work: Path, mapper: str) -> dict[str, Any]:
-    """pycolmap's mapper on the same pictures, camera unknown, sequential matching with overlap 10.
+    """pycolmap's mapper on the same pictures: see `with_colmap`."""
+    case = cases(work)[name]
+    run = work / f"{name}.msgs"
+    poses, posed, truth, spent, _ = with_colmap(prepare(name, case, work), case, run, work / f"{name}_colmap", mapper)
+    return {
+        **errors(poses, posed, truth, False),
+        "cpu_seconds": {mapper: round(spent[1], 1)},
+        "clock_seconds": {mapper: round(spent[0], 1)},
+    }
+
+
+def with_colmap(
+    source: Path, case: Case, run_folder: Path, place: Path, mapper: str
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[NDArray[np.float64] | None], tuple[float, float], Any]:
+    """cam_from_world (N, 4, 4) and whether each is placed (N,), the truths, seconds of clock and CPU, and the model (or
+    None), by pycolmap's mapper on the frames that a run has of a source; camera unknown, sequential matching with
+    overlap 10.
 
     The second mapper takes the first one's features and matches; their time counts in both rows.
     """
@@ -329,13 +371,10 @@ def measure_colmap(name: str, work: Path, mapper: str) -> dict[str, Any]:
     from msgs_slam.pipelines.run.folder import RunFolder
 
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
-    case = cases(work)[name]
-    run = RunFolder(work / f"{name}.msgs")
+    run = RunFolder(run_folder)
     frames = run.load(FRAMES)
-    source = prepare(name, case, work)
     folder = run.stage("frames") if source.is_file() else source
     names = [f.name for f in frames] if source.is_file() else original_names(source, frames)
-    place = work / f"{name}_colmap"
     database, stored = place / "database.db", place / "seconds.json"
     if not stored.exists():
         shutil.rmtree(place, ignore_errors=True)
@@ -357,17 +396,12 @@ def measure_colmap(name: str, work: Path, mapper: str) -> dict[str, Any]:
         models = pycolmap.incremental_mapping(own, folder, place / mapper)
     spent = time.monotonic() - clock + before[0], time.process_time() - cpu + before[1]
     poses, posed = np.tile(np.eye(4), (len(names), 1, 1)), np.zeros(len(names), bool)
-    if models:
-        model = max(models.values(), key=lambda m: m.num_reg_images())
-        for image in model.images.values():
-            poses[names.index(image.name), :3] = image.cam_from_world().matrix()
-            posed[names.index(image.name)] = True
+    model = max(models.values(), key=lambda m: m.num_reg_images()) if models else None
+    for image in model.images.values() if model is not None else ():
+        poses[names.index(image.name), :3] = image.cam_from_world().matrix()
+        posed[names.index(image.name)] = True
     truth = [case.truth("" if source.is_file() else n, f.source_index) for n, f in zip(names, frames, strict=True)]
-    return {
-        **errors(poses, posed, truth, False),
-        "cpu_seconds": {mapper: round(spent[1], 1)},
-        "clock_seconds": {mapper: round(spent[0], 1)},
-    }
+    return poses, posed, truth, spent, model
 
 
 def in_process(job: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:

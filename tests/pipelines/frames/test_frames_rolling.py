@@ -14,7 +14,17 @@ from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.sfm.bundle import Bundle, adjust_bundle
 from msgs_slam.pipelines.sfm.lens import unknown_camera
-from msgs_slam.pipelines.sfm.rolling import MIN_GAIN, Shutter, adjust_rolling, estimate, read_readout, velocities
+from msgs_slam.pipelines.sfm.rolling import (
+    MIN_GAIN,
+    RollingModel,
+    Shutter,
+    adjust_rolling,
+    estimate,
+    frame_interval,
+    read_readout,
+    velocities,
+    weigh_readout,
+)
 from msgs_slam.pipelines.tracking.adjust import adjust_state
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
@@ -138,6 +148,26 @@ def test_model_is_adjusted_with_the_readout_and_keeps_its_pixels() -> None:
 def test_model_taken_at_once_stays_as_it_is() -> None:
     model, pixels = as_model(adjust_bundle(seen_by(0.0)[0], CAMERA).bundle)
     assert adjust_rolling(model, pixels, TIMES, None, refine_camera=True) is None
+
+
+def test_readout_is_found_only_within_the_time_of_a_frame_and_where_it_bends_nothing() -> None:
+    model, pixels = as_model(adjust_bundle(seen_by(READOUT)[0], CAMERA).bundle)
+    assert adjust_rolling(model, pixels, TIMES, None, refine_camera=True, longest=0.9 * READOUT) is None
+    assert adjust_rolling(model, pixels, TIMES, None, refine_camera=True, longest=1.2 * READOUT) is not None
+    rolling = RollingModel(model, pixels, TIMES)
+    right, wrong = (weigh_readout(rolling, (0.0, seconds)) for seconds in (READOUT, -READOUT))
+    assert right.is_convincing
+    assert right.held_out_gain > 0.3
+    assert 1 < right.scale_change < 1.2
+    assert not wrong.is_convincing
+    assert wrong.held_out_gain < 0
+    assert not replace(right, scale_change=7.0).is_convincing
+
+
+def test_interval_between_images_is_that_of_the_source() -> None:
+    assert frame_interval(np.array([0.0, 0.1, 0.2, 0.3]), np.array([0, 3, 6, 9])) == pytest.approx(1 / 30)
+    assert frame_interval(np.array([0.0, 0.1, 5.0, 5.1]), np.array([0, 1, 2, 3])) == pytest.approx(0.1)
+    assert frame_interval(np.array([1.0]), np.array([0])) == 0
 
 
 @pytest.mark.parametrize("together", [True, False])
