@@ -1,5 +1,6 @@
 """Stage 1: pictures of the source become frames with timestamps, a calibrated camera and a backbone of keyframes."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -30,6 +31,7 @@ from ..source.opening import FolderSource, Source, open_source
 from ..source.sharpness import reduce_image
 from ..system.parallel import parallel_map
 from ..types import Calibration, Frame, GivenPoses
+from .defects import warn_of_defects
 from .findings import in_world_of, settled_origin, to_sparse_model, warn_of_focal, warn_of_given, warn_of_structure
 from .inputs import require_several
 from .keyframes import KeyframeChoice, choose_keyframes, pick_frames
@@ -39,6 +41,8 @@ from .tasks import TASKS, known_camera, structure_from_motion
 
 _FEW_KEYFRAMES = 12
 _UNSURE_FOCAL = 0.05
+_NOISE_IMAGES = 8
+"""Keyframes of which noise is measured."""
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -66,12 +70,16 @@ def run(context: StageContext) -> dict[str, Any]:
             raise InputError(blame) from error
         raise
     lens = make_lens(structure.model.cameras[1])
-    origin = settled_origin(context, origin, camera, structure)
+    origin, focal_sd = settled_origin(context, origin, camera, structure), structure.focal_sd
     if len(rig) == 1:
         times = np.array([frames[k].timestamp for k in keyframes])
         straight = straight_copy(structure.model, [f.xy for f in structure.features], times, structure.readout)
         origin = warn_of_focal(context, origin, camera, structure, straight)
-    calibration = replace(_calibration(context, lens, origin, structure.focal_sd, faces), readout=structure.readout)
+        evenly = keyframes[:: -(-len(keyframes) // _NOISE_IMAGES)]
+        noise = warn_of_defects(context, [grey_of(context, masks, frames[k])[0] for k in evenly], straight)
+        if structure.focal_sd:
+            focal_sd = math.hypot(focal_sd, noise * structure.model.cameras[1].mean_focal_length())
+    calibration = replace(_calibration(context, lens, origin, focal_sd, faces), readout=structure.readout)
     _write_backbone(context, structure, keyframes, lens, frames)
     _write_correspondences(context, structure, keyframes, lens)
     _write_frames(context, source, frames, lens)
