@@ -26,6 +26,7 @@ from .fields import FINE, Basis, DepthFields, Equations, Grid, Prior, solve_fiel
 Array = NDArray[np.float64]
 
 SAMPLES_ACROSS = 40
+"""Along the longer side of a view."""
 SIDE = 320
 """Pixels on the long side of the depths that are compared."""
 POINT_SD = 0.01

@@ -43,7 +43,10 @@ class Basis:
 
 @dataclass(frozen=True)
 class Grid:
-    """rows x columns nodes that span an image from corner to corner; between them the log scale is bilinear."""
+    """rows x columns nodes that span an image from corner to corner; between them the log scale is bilinear.
+
+    The columns lie along the longer side of the image, so that nodes are as far apart in an upright image.
+    """
 
     rows: int
     columns: int
@@ -55,6 +58,8 @@ class Grid:
 
     def at(self, xy: Array, width: int, height: int) -> Basis:
         """The nodes around pixels xy (Q, 2) of an image of that size."""
+        if height > width:
+            xy, width, height = xy[:, ::-1], height, width
         gx = np.clip(xy[:, 0] / width, 0, 1) * (self.columns - 1)
         gy = np.clip(xy[:, 1] / height, 0, 1) * (self.rows - 1)
         left, top = np.minimum(gx.astype(int), self.columns - 2), np.minimum(gy.astype(int), self.rows - 2)
@@ -75,7 +80,9 @@ FINE = Grid(9, 12)
 
 
 def field_scales(nodes: Array, height: int, width: int) -> NDArray[np.float32]:
-    """(H, W) the scale of every pixel by log scales at (rows, columns) nodes."""
+    """(H, W) the scale of every pixel by log scales at (rows, columns) nodes of a `Grid`."""
+    if height > width:
+        return np.ascontiguousarray(field_scales(nodes, width, height).T)
     rows, columns = nodes.shape
     x = (np.arange(width) + 0.5) / width * (columns - 1)
     y = (np.arange(height) + 0.5) / height * (rows - 1)

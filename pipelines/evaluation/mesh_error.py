@@ -144,7 +144,7 @@ def true_surface(matched: MatchedTruth) -> tuple[NDArray[np.float64], list[_Seen
         k = sequence.camera.resized(depth.shape[1], depth.shape[0])
         camera = Intrinsics(k.width, k.height, k.fx, k.fy, k.cx, k.cy)
         pose = matched.world_from_cam[row]
-        points.append(depth_points(depth, camera, pose, stride=max(1, depth.shape[1] // 320)))
+        points.append(depth_points(depth, camera, pose, stride=max(1, max(depth.shape) // 320)))
         views.append((depth, camera, np.linalg.inv(pose)))
     return (thinned(np.concatenate(points), CELL) if points else np.zeros((0, 3))), views
 

@@ -33,14 +33,14 @@ _MIN_SURVIVORS = 0.5
 @dataclass(frozen=True)
 class KeyframeChoice:
     """keyframes: indices of the chosen frames; displacement (N,): median displacement of each frame from the keyframe
-    before it, as a fraction of the width, infinite where the tracks were lost."""
+    before it, as a fraction of the longer side, infinite where the tracks were lost."""
 
     keyframes: list[int]
     displacement: NDArray[np.float64]
 
     @property
     def largest_displacement(self) -> float:
-        """Largest displacement that was seen, as a fraction of the width."""
+        """Largest displacement that was seen, as a fraction of the longer side."""
         return float(self.displacement.max(initial=0.0))
 
 
@@ -48,7 +48,8 @@ def choose_keyframes(
     frames: Iterable[tuple[NDArray[np.uint8], NDArray[np.bool_] | None]], parallax: float
 ) -> KeyframeChoice:
     """Keyframes of grey frames (H, W) in order of time, each with a mask (H, W) of what is no part of the scene: one
-    whenever points have moved by `parallax`, as a fraction of the width; the first, and the last where it adds a view.
+    whenever points have moved by `parallax`, as a fraction of the longer side; the first, and the last where it adds
+    a view.
     """
     tracker = _Tracker()
     keyframes: list[int] = []
@@ -84,7 +85,7 @@ class _Tracker:
         self._started = len(self._origin)
 
     def advance(self, gray: NDArray[np.uint8]) -> tuple[float, float]:
-        """Median displacement since the keyframe (fraction of the width) and the share of its tracks that live."""
+        """Median displacement since the keyframe (fraction of the longer side), and the share of its tracks alive."""
         previous, self._previous = self._previous, gray
         if previous is None:
             return 0.0, 1.0
@@ -98,7 +99,7 @@ class _Tracker:
         if len(self._points) < min(_MIN_TRACKS, self._started):
             return np.inf, survivors
         distance = np.linalg.norm(self._points - self._origin, axis=1)
-        return float(np.median(distance)) / gray.shape[1], survivors
+        return float(np.median(distance)) / max(gray.shape), survivors
 
 
 def pick_frames(context: StageContext, source: Source, faces: Faces | None) -> list[Frame]:

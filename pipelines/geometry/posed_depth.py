@@ -30,8 +30,9 @@ class PosedDepth:
     trust: NDArray[np.float32]
 
     def grid(self, across: int) -> tuple[Array, Array, NDArray[np.float64]]:
-        """xy (S, 2), depth (S,) and trust (S,) of the known pixels of a coarse grid, `across` over the width."""
-        stride = max(self.intrinsics.width // across, 1)
+        """xy (S, 2), depth (S,) and trust (S,) of the known pixels of a coarse grid, `across` along the longer
+        side."""
+        stride = max(max(self.intrinsics.width, self.intrinsics.height) // across, 1)
         picked = (slice(stride // 2, None, stride),) * 2
         depth, trust = self.depth[picked].astype(np.float64), self.trust[picked].astype(np.float64)
         rows, columns = np.nonzero(depth > 0)

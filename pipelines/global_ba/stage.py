@@ -170,7 +170,8 @@ def loop_drift_px(loop: Loop, state: TrackState, intrinsics: Intrinsics) -> floa
     if len(seen) == 0:
         return 0.0
     in_cam = state.points[seen.point] @ motion[:3, :3].T + motion[:3, 3]
-    return float(min(np.median(reprojection_errors(in_cam, seen.xy, intrinsics)), intrinsics.width))
+    longer = max(intrinsics.width, intrinsics.height)
+    return float(min(np.median(reprojection_errors(in_cam, seen.xy, intrinsics)), longer))
 
 
 def poses_of(trajectory: Trajectory, frame_ids: NDArray[np.int64]) -> Array:

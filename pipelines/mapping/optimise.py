@@ -138,7 +138,7 @@ class MapOptimiser:
             self._note(notes, rows, view, pose, values)
         rates = {key: rate * step.rate for key, rate in MAP_RATES.items()}
         parameters.table.step(of_map, rates, self._shares(rows, values["log_radii"].detach()), rows)
-        self.state.step_pose(step.view, view, of_view.get("pose"), POSE_RATE * step.rate)
+        self.state.step_pose(step.view, view, of_view.get("pose"), POSE_RATE * step.rate, self.unit)
         return rendering
 
     @torch.no_grad()

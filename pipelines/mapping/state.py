@@ -41,11 +41,13 @@ class OptimisedMap:
 
 @dataclass(frozen=True)
 class PoseStep:
-    """A view's pose before it was refined, and the gradient by which its twist is to move; None for not at all."""
+    """A view's pose before it was refined, and the gradient by which its twist is to move; None for not at all. `rate`:
+    of Adam, in radians, and in shares of the `unit` of length."""
 
     cam_from_world: Tensor
     gradient: Tensor | None
     rate: float
+    unit: float
 
 
 @dataclass
@@ -100,9 +102,10 @@ class OptimiserState:
             self.settle_poses()
         return se3.exp(self.view_tables[index].values["twist"].detach().double()) @ view.cam_from_world
 
-    def step_pose(self, index: int, view: View, gradient: Tensor | None, rate: float) -> None:
-        """One step of Adam for the view's twist by the gradient of its pose (4, 4), wherever that lies."""
-        self._waiting[index] = PoseStep(view.cam_from_world, gradient, rate)
+    def step_pose(self, index: int, view: View, gradient: Tensor | None, rate: float, unit: float) -> None:
+        """One step of Adam for the view's twist by the gradient of its pose (4, 4), wherever that lies. `rate`: of the
+        rotation in radians, of the translation in shares of `unit`, a length of the scene."""
+        self._waiting[index] = PoseStep(view.cam_from_world, gradient, rate, unit)
         if gradient is None or gradient.device.type == "cpu":
             self.settle_poses()
 
@@ -119,7 +122,7 @@ class OptimiserState:
                 with torch.enable_grad():
                     pose = moved(step.cam_from_world, twist)
                 gradients["twist"] = torch.autograd.grad(pose, twist, next(found).to(pose))[0]
-            table.step(gradients, {"twist": step.rate})
+            table.step(gradients, {"twist": step.rate}, {"twist": torch.tensor([step.unit] * 3 + [1.0] * 3)})
 
     def result(self, views: Sequence[View], iterations: int) -> OptimisedMap:
         """The values without the optimiser's own."""

@@ -39,8 +39,8 @@ _KEPT = 128
 
 @dataclass(frozen=True)
 class Rules:
-    """Depth of what confidence may accuse; over what gap (share of the width) pieces are one thing; whether a witness
-    must have the place in sight at which the accused pixel's own depth puts it."""
+    """Depth of what confidence may accuse; over what gap (share of the longer side) pieces are one thing; whether a
+    witness must have the place in sight at which the accused pixel's own depth puts it."""
 
     confidence: float
     gap: float
@@ -208,7 +208,7 @@ def _judge(
 
 def _things(evidence: NDArray[np.bool_], gap: float, before: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
     """(h, w) pieces of evidence that are close together, as things with a rim; with `before` those that touch it."""
-    reach = max(1, round(gap * evidence.shape[1]))
+    reach = max(1, round(gap * max(evidence.shape)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     around = cv2.copyMakeBorder(evidence.astype(np.uint8), *(reach,) * 4, cv2.BORDER_CONSTANT, value=0)
     closed = cv2.morphologyEx(around, cv2.MORPH_CLOSE, disc)[reach:-reach, reach:-reach]

@@ -293,7 +293,8 @@ def _field_slopes(field: Array, at: Basis, size: NDArray[np.int64]) -> Array:
     a, b, c, d = field[at.nodes].T
     right, down = at.weights[:, [1, 3]].sum(1), at.weights[:, 2:].sum(1)
     slopes = np.stack([(b - a) * (1 - down) + (d - c) * down, (c - a) * (1 - right) + (d - b) * right], 1)
-    return slopes * ([FINE.columns - 1, FINE.rows - 1] / size)
+    turn = slice(None, None, 1 if size[0] >= size[1] else -1)  # a grid's columns lie along the longer side
+    return (slopes * ([FINE.columns - 1, FINE.rows - 1] / size[turn]))[:, turn]
 
 
 def _moving(points: Array) -> Array:

@@ -198,7 +198,9 @@ def _rotated(pose: Tensor) -> Tensor:
 
 
 def _looks(view: View) -> tuple[NDArray[np.uint8], float]:
-    labels = np.asarray(cv2.resize(view.channels.numpy(), _GRID, interpolation=cv2.INTER_NEAREST), np.uint8)
+    height, width = view.depth.shape
+    size = _GRID if width >= height else _GRID[::-1]
+    labels = np.asarray(cv2.resize(view.channels.numpy(), size, interpolation=cv2.INTER_NEAREST), np.uint8)
     return labels, float(view.trust.mean())
 
 
@@ -214,8 +216,8 @@ def fitted_field(view: View, shown: NDArray[np.float32], solid: NDArray[np.bool_
     middle = float(np.median(logs[weight > 0]))
     weight *= np.abs(logs - middle) < 0.3  # across the edge of something
     size = (FINE.columns, FINE.rows)
-    blurred = [
-        cv2.GaussianBlur(a, (0, 0), proxy.shape[1] / FINE.columns / 2) for a in (weight * (logs - middle), weight)
-    ]
+    kept = (weight * (logs - middle), weight)
+    along = kept if proxy.shape[1] >= proxy.shape[0] else [np.ascontiguousarray(a.T) for a in kept]
+    blurred = [cv2.GaussianBlur(a, (0, 0), max(proxy.shape) / FINE.columns / 2) for a in along]
     total, share = (cv2.resize(a, size, interpolation=cv2.INTER_AREA).astype(np.float64) for a in blurred)
     return middle + total / (share + 0.05)

@@ -16,8 +16,8 @@ from .gaussians import Gaussians, semantic_image, show
 from .rerender import CELL, SAME_SURFACE, SD_DEPTH, Rerendering, Samples, sample
 
 SMALLEST, LEVELS = 60, 4
-"""Sizes that a frame is compared at, each half the next, at most so many and down to this width: frames of ten images
-a second move by 50 pixels."""
+"""Sizes that a frame is compared at, each half the next, at most so many and down to this longer side: frames of ten
+images a second move by 50 pixels."""
 _FEWER = (0, 2, 3, 4)
 """Taken from the width of `CELL`, the whole size first: of small images more of the pixels are drawn."""
 _MIN_SEEN = 0.1
@@ -129,6 +129,6 @@ class _Problem:
 def _sizes(view: View) -> list[View]:
     """The view at all sizes, the whole first."""
     views = [view]
-    while len(views) < LEVELS and views[-1].intrinsics.width >= 2 * SMALLEST:
+    while len(views) < LEVELS and max(views[-1].image.shape[:2]) >= 2 * SMALLEST:
         views.append(halved(views[-1]))
     return views

@@ -24,7 +24,7 @@ MIN_SHARED = 100
 _MAX_CORNERS, _DISTANCE = 1000, 3.0
 """Corners of an image, and pixels between them."""
 _MIN_GUESS, _GUESS_ERROR = 8, 0.03
-"""Matches for a first guess of where corners go, a homography, and their error, as a share of the image's width."""
+"""Matches for a first guess of where corners go, a homography, and their error, as a share of the longer side."""
 
 Picture = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
 """(H, W) grey, and what is left out of it."""
@@ -186,7 +186,7 @@ def _followed(
         (last, hidden_last, features[2], behind.matches),
     )
     for grey, left_out, other, matches in sides:
-        guess = _guess(features[1].xy[matches[:, 0]], other.xy[matches[:, 1]], xy, grey.shape[1])
+        guess = _guess(features[1].xy[matches[:, 0]], other.xy[matches[:, 1]], xy, max(grey.shape))
         at, ok = follow(middle, grey, xy, guess)
         if left_out is not None:
             column, row = np.nan_to_num(at).astype(np.int64).T
@@ -196,12 +196,12 @@ def _followed(
     return [there[0][seen], xy[seen], there[1][seen]]
 
 
-def _guess(source: Array, target: Array, xy: Array, width: int) -> Array:
+def _guess(source: Array, target: Array, xy: Array, side: int) -> Array:
     """(Q, 2) where points are about, by the homography of most matches: what far things do, and turns."""
     nowhere = np.full_like(xy, np.nan)
     if len(source) < _MIN_GUESS:
         return nowhere
-    homography, _ = cv2.findHomography(source, target, cv2.USAC_MAGSAC, _GUESS_ERROR * width)
+    homography, _ = cv2.findHomography(source, target, cv2.USAC_MAGSAC, _GUESS_ERROR * side)
     if homography is None or len(xy) == 0:
         return nowhere
     moved = np.c_[xy, np.ones(len(xy))] @ homography.T

@@ -23,12 +23,12 @@ _FINE_FACTORS = np.geomspace(0.85, 1.18, 9)
 
 
 def require_motion(largest_displacement: float) -> None:
-    """Raise InputError for a camera that does not move; displacement as a fraction of the image width."""
+    """Raise InputError for a camera that does not move; displacement as a fraction of the image's longer side."""
     if largest_displacement < _MOVING_FRACTION:
         raise InputError(
             f"there is no parallax: over the whole source the image moves by at most {largest_displacement:.2%} of "
-            f"its width, so no depth can be found. Either the camera stands still, or the images are black or all the "
-            f"same: look at them. {HOW_TO_FILM}"
+            f"its longer side, so no depth can be found. Either the camera stands still, or the images are black or "
+            f"all the same: look at them. {HOW_TO_FILM}"
         )
 
 

@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 
 _MIN_SHARED = 30
 _MIN_MATCHES, _NEAR, _OUTLIER = 12, 0.05, 3.0
-"""A loop between windows: its least matches, their median error as a share of the image's width, from where it is
-left to `global_ba`, and how many medians a match may be off. On made-up walks only."""
+"""A loop between windows: its least matches, their median error as a share of the image's longer side, from
+where it is left to `global_ba`, and how many medians a match may be off. On made-up walks only."""
 _READOUT_ROUNDS = 3
 """Each step falls a little short."""
 WIDE = 40.0
@@ -122,7 +122,7 @@ def close_loops(
         seen = points @ pose[:3, :3].T + pose[:3, 3]
         error = np.linalg.norm(np.asarray(camera.img_from_cam(seen)) - xy[pair.second][[b for _, b in rows]], axis=1)
         error = np.where((seen[:, 2] > 0) & np.isfinite(error), error, np.inf)
-        if not (middle := float(np.median(error))) <= _NEAR * camera.width:
+        if not (middle := float(np.median(error))) <= _NEAR * max(camera.width, camera.height):
             continue
         for (p, q), off in zip(ids, error, strict=True):
             if p != q and off <= _OUTLIER * middle and model.exists_point3D(p) and model.exists_point3D(q):

@@ -33,7 +33,7 @@ POWER = 2.0
 """A view counts with this power of its pixels a length on the surface, times how sharp it is. The mean of many views
 lies nearer to each of them than that of the best: on kitchen 24.4 dB instead of 23.5 with six views and 4."""
 _FEATHER = 0.04
-"""Weights fade over this part of the image's width beside its rim and beside what is hidden."""
+"""Weights fade over this part of the image's longer side beside its rim and beside what is hidden."""
 _BAND = 64
 
 
@@ -103,7 +103,7 @@ def _seen(atlas: Atlas, shot: Shot) -> tuple[NDArray[np.float32], NDArray[np.flo
     if shot.hidden is not None:
         shows &= ~shot.hidden
     away = cv2.distanceTransform(np.pad(shows.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
-    return mesh, np.minimum(away / (_FEATHER * camera.width), 1).astype(np.float32)
+    return mesh, np.minimum(away / (_FEATHER * max(camera.width, camera.height)), 1).astype(np.float32)
 
 
 def _in_bands(rows: int, task: Callable[[int, int], None]) -> None:

@@ -195,6 +195,17 @@ def test_wrong_poses_are_put_right(room: MappingInput, mapped: OptimisedMap, mon
     assert np.array_equal(result.cam_from_world[0], truth[0])
 
 
+@pytest.mark.parametrize("unit", [1.0, 20.0])
+def test_the_first_step_of_a_pose_is_a_share_of_the_scenes_size(room: MappingInput, unit: float) -> None:
+    views = [in_unit(v, unit) for v in room.views[:2]]
+    optimiser = MapOptimiser(views, len(room.class_ids), SETTINGS, OptimiserState.fresh(views, 2, None, None))
+    optimiser.visit(Step(0, 1.0, 0.1, True, seed=Seeding.EVERYTHING))
+    twist = optimiser.state.view_tables[0].values["twist"].detach().numpy()
+    assert optimiser.unit == pytest.approx(unit * scene_depth(room.views[:2]))
+    assert np.abs(twist[3:]) == pytest.approx(0.1 * POSE_RATE)
+    assert np.abs(twist[:3]) == pytest.approx(0.1 * POSE_RATE * optimiser.unit)
+
+
 def test_exposure_is_found(room: MappingInput, mapped: OptimisedMap, monkeypatch: pytest.MonkeyPatch) -> None:
     """One view darkened by a third: its gain says so, those of the others stay near 0."""
     dark = [
