@@ -118,12 +118,15 @@ class FrameMasks:
         return f"{by} leave only {left:.1%} of the images, too little for a reconstruction. {rule}"
 
     def write(self, folder: Path, frames: Sequence[Frame], lens: Lens) -> dict[str, Any]:
-        """Write the masks of the undistorted frames that have any; how many these are, and how much they leave out."""
+        """Write the masks of the undistorted frames that have any, or on which the lens folds over; how many leave out
+        what the frame itself shows, and how much that is."""
         shares = []
         for frame in frames:
             left_out = self.left_out(frame, lens.pinhole.width, lens.pinhole.height)
+            undistorted = None if left_out is None else lens.undistort_mask(left_out)
+            if (unseen := any_of((undistorted, lens.folded))) is not None:
+                LEFT_OUT.save(folder, unseen, frame.name)
             if left_out is not None:
-                LEFT_OUT.save(folder, lens.undistort_mask(left_out), frame.name)
                 shares.append(float(left_out.mean()))
         return {"masked_frames": len(shares), "masked_share": round(float(np.mean(shares)), 4)} if shares else {}
 

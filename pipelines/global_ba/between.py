@@ -35,7 +35,7 @@ from ..tracking.front_end import FrontEnd
 from ..tracking.pictures import Pictures
 from ..tracking.pnp import FramePose, group_by_points, predict_pose, recognise
 from ..tracking.state import NO_SIGHTINGS, Sightings, TrackState
-from ..types import Array, Features, Trajectory
+from ..types import Array, Features, Trajectory, any_of
 
 Image = NDArray[np.uint8]
 _SNAPSHOT_EVERY = 200
@@ -138,20 +138,24 @@ def _cut(context: StageContext, source: Any, done: set[int]) -> Iterator[tuple[V
 
 
 class SourcePictures(Pictures):
-    """Pictures by their numbers in the source; `at_hand` are those that are no frames of the run."""
+    """Pictures by their numbers in the source; `at_hand` are those that are no frames of the run, and `around` each of
+    them are such frames."""
 
-    def __init__(self, run: RunFolder, settings: FramesConfig, memory: float, numbers: list[int]) -> None:
-        super().__init__(run, settings, memory)
+    def __init__(self, run: RunFolder, settings: FramesConfig, numbers: list[int]) -> None:
+        super().__init__(run, settings)
         self.frames = {number: self.frames[i] for i, number in enumerate(numbers)}
         self.at_hand: dict[int, Image] = {}
+        self.around: dict[int, list[int]] = {}
 
     def color(self, frame_id: int) -> Image:
         """(H, W, 3) RGB."""
         return self.at_hand[frame_id] if frame_id in self.at_hand else super().color(frame_id)
 
     def left_out(self, frame_id: int) -> NDArray[np.bool_] | None:
-        """(H, W) what is no part of the scene; of pictures at hand nothing is known."""
-        return None if frame_id in self.at_hand else super().left_out(frame_id)
+        """(H, W) what is no part of the scene, None where all of it is; of a picture at hand what of no frame around it
+        is."""
+        around = self.around[frame_id] if frame_id in self.at_hand else [frame_id]
+        return any_of(super(SourcePictures, self).left_out(i) for i in around)
 
     def _load_features(self, frame_id: int) -> Features:
         frame = self.frames.get(frame_id)
@@ -190,7 +194,7 @@ class Placer:
         for name in ("poses", "sightings", "segment"):
             setattr(self.state, name, {numbers[i]: value for i, value in getattr(self.state, name).items()})
         self.state.keyframes = [numbers[k] for k in self.state.keyframes]
-        self.pictures = SourcePictures(run, config.frames, context.memory_room, numbers)
+        self.pictures = SourcePictures(run, config.frames, numbers)
         self.front_end, self.seed = FrontEnd(self.state, self.pictures, config.run.seed), config.run.seed
 
     def place(self, index: int, time: float, images: list[Image]) -> Placed | None:
@@ -202,6 +206,7 @@ class Placer:
         if all(i in self.lost for i in beside):
             return Placed(index, time, np.eye(4), self.lost[beside[0]])
         self.pictures.at_hand = {c * _STATIONS + index: image for c, image in enumerate(images)}
+        self.pictures.around = {n: [n - index + i for i in beside] for n in self.pictures.at_hand}
         found = [(number, *self._find(number, time)) for number in self.pictures.at_hand]
         number, seen, solved = max(found, key=lambda f: 0 if f[2] is None else int(f[2].inliers.sum()))
         if solved is None or not self.front_end.is_trusted(seen, solved):

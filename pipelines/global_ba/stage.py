@@ -95,7 +95,7 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
     if snapshot.exists():
         return load_value(snapshot)
     run, settings, seed = context.run, context.config.global_ba, context.config.run.seed
-    pictures = Pictures(run, context.config.frames, context.memory_room)
+    pictures = Pictures(run, context.config.frames)
     views = keyframe_views(context, model, pictures)
     ids = model.frame_ids.tolist()
     all_features = map(pictures.features, context.progress.track(ids, "features", len(ids)))

@@ -12,6 +12,7 @@ from ...formats.datasets.sequence import Camera
 from ..types import Calibration, Intrinsics
 
 _BORDER_POINTS = 65
+_TURN_STEPS = 501
 _FOCAL_ROUNDS = 6
 FOCAL_GUESS = 1.2
 """Focal length in longer sides of the image where it is unknown."""
@@ -111,6 +112,16 @@ class Lens:
         return cv2.remap(mask.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) > 0
 
     @cached_property
+    def folded(self) -> NDArray[np.bool_] | None:
+        """(H, W) pixels of the pinhole beyond where the distortion turns back, which would show a second time what lies
+        within; None where it does not turn back inside the frame."""
+        k = self.pinhole
+        turn = _turning_radius(self.camera, k)
+        across, down = ((np.arange(n) + 0.5 - c) / f for n, c, f in ((k.width, k.cx, k.fx), (k.height, k.cy, k.fy)))
+        beyond = np.hypot(across, down[:, None]) >= turn
+        return beyond if beyond.any() else None
+
+    @cached_property
     def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(H, W) columns and rows of the source, as OpenCV counts them, of the pixels of the pinhole."""
         columns, rows = np.meshgrid(np.arange(self.pinhole.width) + 0.5, np.arange(self.pinhole.height) + 0.5)
@@ -155,6 +166,17 @@ def _distort(camera: pycolmap.Camera, pinhole: Intrinsics, xy: NDArray[np.float6
     rays = np.ones((len(xy), 3))
     rays[:, :2] = (xy - [pinhole.cx, pinhole.cy]) / [pinhole.fx, pinhole.fy]
     return np.asarray(camera.img_from_cam(rays))
+
+
+def _turning_radius(camera: pycolmap.Camera, pinhole: Intrinsics) -> float:
+    """Tangent of the least angle to the axis from where on the image of a ray moves back towards the centre, to a 500th
+    of what the pinhole sees; infinite where there is none."""
+    rays = (_border(pinhole.width, pinhole.height) - [pinhole.cx, pinhole.cy]) / [pinhole.fx, pinhole.fy]
+    along = np.linspace(0.0, 1.0, _TURN_STEPS)[:, None, None] * rays
+    flat = along.reshape(-1, 2) * [pinhole.fx, pinhole.fy] + [pinhole.cx, pinhole.cy]
+    seen = _distort(camera, pinhole, flat).reshape(along.shape) - [camera.principal_point_x, camera.principal_point_y]
+    turns = np.diff(np.linalg.norm(seen, axis=2), axis=0) < 0
+    return float(np.where(turns, np.linalg.norm(along[:-1], axis=2), np.inf).min())
 
 
 def _border(width: int, height: int) -> NDArray[np.float64]:

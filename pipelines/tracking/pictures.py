@@ -1,9 +1,7 @@
 """Grey images and features of frames, the last few kept in memory."""
 
-import math
-import sys
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -16,11 +14,10 @@ from ..run.files import CALIBRATION, FEATURES, FRAMES, VOCABULARY
 from ..run.folder import RunFolder
 from ..sfm.retrieval import describe
 from ..sfm.rolling import Shutter
-from ..system.parallel import LruSequence
 from ..types import Features, ProxyMaps
 
 T = TypeVar("T")
-_DESCRIPTORS_SHARE = 0.05
+_COMPARED_TOGETHER = 64
 
 
 class _Recent(Generic[T]):
@@ -45,10 +42,10 @@ def load_shutter(run: RunFolder) -> Shutter:
 
 
 class Pictures:
-    """Everything tracking looks up by frame id, and the camera. Memory does not grow with the number of frames: of
-    `memory` bytes descriptors take no more than a small share."""
+    """Everything tracking looks up by frame id, and the camera. Memory does not grow with the number of frames, and by
+    16 KB with each keyframe that is compared with another frame."""
 
-    def __init__(self, run: RunFolder, settings: FramesConfig, memory: float = math.inf, kept: int = 12) -> None:
+    def __init__(self, run: RunFolder, settings: FramesConfig, kept: int = 12) -> None:
         self.run, self.settings = run, settings
         self.vocabulary = run.load(VOCABULARY)
         self.frames = {f.id: f for f in run.load(FRAMES)}
@@ -57,13 +54,8 @@ class Pictures:
         self._grey = _Recent(lambda i: to_grey(self.color(i)), kept)
         self._left_out = _Recent(lambda i: run.left_out(self.frames[i]), kept)
         self._features = _Recent(self._load_features, 4 * kept)
-        # 64 x 128 numbers a frame: 32 MB for a thousand.
-        self._descriptor = LruSequence(
-            sys.maxsize,  # images that are added have numbers beyond the frames'
-            lambda i: describe(self.features(i), self.vocabulary),
-            lambda d: d.nbytes,
-            _DESCRIPTORS_SHARE * memory,
-        )
+        # 64 x 128 numbers each. All are asked for again and again in order: of a part of them none would ever be there.
+        self._descriptors: dict[int, NDArray[np.float16]] = {}
 
     def color(self, frame_id: int) -> NDArray[np.uint8]:
         """(H, W, 3) RGB."""
@@ -97,8 +89,23 @@ class Pictures:
         return picture_features(self.color(frame_id), self.left_out(frame_id), self.settings, self._learned)
 
     def descriptor(self, frame_id: int) -> NDArray[np.float32]:
-        """Return the global descriptor of a frame, for retrieval."""
-        return self._descriptor[frame_id]
+        """Compute the global descriptor (D,) of a frame, for retrieval."""
+        return describe(self.features(frame_id), self.vocabulary)
+
+    def descriptors(self, keyframes: Sequence[int]) -> NDArray[np.float16]:
+        """Return the global descriptors (K, D) of keyframes, which are kept."""
+        for k in keyframes:
+            if k not in self._descriptors:
+                self._descriptors[k] = self.descriptor(k).astype(np.float16)
+        return np.array([self._descriptors[k] for k in keyframes]).reshape(len(keyframes), -1)
+
+    def similarities(self, descriptors: NDArray[np.floating], keyframes: Sequence[int]) -> NDArray[np.float32]:
+        """Compute how alike frames of global descriptors (F, D) look to keyframes: (F, K), by chance 0."""
+        ours, out = descriptors.astype(np.float32), np.empty((len(descriptors), len(keyframes)), np.float32)
+        for first in range(0, len(keyframes), _COMPARED_TOGETHER):
+            some = slice(first, first + _COMPARED_TOGETHER)
+            out[:, some] = ours @ self.descriptors(keyframes[some]).astype(np.float32).T
+        return out
 
     def proxy(self, frame_id: int) -> ProxyMaps | None:
         """Proxy maps where the frame has any."""

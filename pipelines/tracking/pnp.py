@@ -186,8 +186,7 @@ def _candidate_groups(frame_id: int, state: TrackState, pictures: Pictures, coun
     """Keyframes worth matching; neighbours that see common points are one group, so that their points add up."""
     if not state.keyframes:
         return []
-    ours = pictures.descriptor(frame_id)
-    scores = np.array([float(pictures.descriptor(k) @ ours) for k in state.keyframes])
+    (scores,) = pictures.similarities(pictures.descriptor(frame_id)[None], state.keyframes)
     alike = [state.keyframes[i] for i in np.argsort(-scores, kind="stable")[:count]]
     return group_by_points({*alike, *state.nearest_keyframes(frame_id, 1)}, state)
 

@@ -1,6 +1,6 @@
 """Joining stretches that began anew after a loss, when a keyframe of one is recognised in another."""
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -33,15 +33,16 @@ def join_segments(state: TrackState, pictures: Pictures, seed: int) -> int:
 
     One keyframe is not believed: two must be recognised, and agree on the transform between the worlds.
     """
-    joined, again = 0, True
-    while again:
-        again = False
-        main, *others = state.segment_sizes() or [0]
-        for segment in others:
-            if _join(segment, main, state, pictures, seed):
-                joined, again = joined + 1, True
-                break
-    return joined
+    main, *others = state.segment_sizes() or [0]
+    waiting, since = deque(others), 0
+    while since < len(waiting):  # those that have not been compared with what joined since
+        segment = waiting.popleft()
+        since += 1
+        if _join(segment, main, state, pictures, seed):
+            since = 0
+        else:
+            waiting.append(segment)
+    return len(others) - len(waiting)
 
 
 def split_segments(state: TrackState) -> None:
@@ -69,9 +70,9 @@ def split_segments(state: TrackState) -> None:
 def _join(segment: int, main: int, state: TrackState, pictures: Pictures, seed: int) -> bool:
     ours = [k for k in state.keyframes if state.segment[k] == segment]
     theirs = [k for k in state.keyframes if state.segment[k] == main]
-    looks = np.array([[float(pictures.descriptor(a) @ pictures.descriptor(b)) for b in theirs] for a in ours])
+    looks = pictures.similarities(pictures.descriptors(ours), theirs)
     answers: list[tuple[int, Similarity, Sightings]] = []
-    gap = np.array([min(abs(a - b) for b in theirs) for a in ours])
+    gap = np.array([np.abs(np.subtract(theirs, a)).min() for a in ours])
     near = np.argsort(gap, kind="stable")[: TRIES // 3].tolist()
     for n in near + [i for i in np.argsort(-looks.max(1), kind="stable")[:TRIES].tolist() if i not in near]:
         alike = [theirs[i] for i in np.argsort(-looks[n], kind="stable")[:3]]

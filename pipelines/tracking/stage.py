@@ -35,7 +35,7 @@ def run(context: StageContext) -> dict[str, Any]:
     proxy = context.run.load(FIGURES["proxy"])
     settings = without_dependent_depth(context.config.tracking, proxy)
     metric = bool(proxy.get("metric", False))
-    pictures = Pictures(context.run, context.config.frames, context.memory_room)
+    pictures = Pictures(context.run, context.config.frames)
     intrinsics = pictures.intrinsics
 
     state = track_frames(context, frames, pictures)

@@ -158,12 +158,12 @@ class MultiviewDepth:
         first = self.first_case(index)
         if first is None:
             return None
-        asked = self._present(self._neighbours(index, ASKED))
+        asked = self._lenders(index)[:ASKED]
         return ask_again(first, [self._completed(j) for j in asked.tolist()], self._half_warps(index, asked))
 
     def _gather(self, index: int) -> Case | None:
         """Do the same from what keyframes know by themselves."""
-        lenders = self._present(self._neighbours(index, LENDERS))
+        lenders = self._lenders(index)
         lent = [self._half_warps(j, np.array([index]))[0] for j in lenders.tolist()]
         halves = [self._half(j) for j in lenders.tolist()]
         return gather_case(self._half(index), halves, lent, self._half_warps(index, lenders[:ASKED]))
@@ -240,6 +240,10 @@ class MultiviewDepth:
 
     def _path(self, frame_id: int) -> Path:
         return self._folder() / f"{frame_id:06d}.npz"
+
+    def _lenders(self, index: int) -> NDArray[np.int64]:
+        """Return neighbours that have a depth map, the nearest first, of which both rounds ask the first `ASKED`."""
+        return self._present(self._neighbours(index, LENDERS))
 
     def _present(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
         """Those that have a raw depth map."""

@@ -282,6 +282,28 @@ def test_pincushion_distortion_zooms_in_just_enough() -> None:
     assert np.abs(source[0]).min() < 1  # the corner shows the source's edge, not less
 
 
+@pytest.mark.parametrize(("focal", "k1", "share"), [(0.5, -0.3, 0.02), (0.45, -0.25, 0.027), (0.5, -0.15, 0.0)])
+def test_what_a_strong_lens_would_show_twice_is_left_out(focal: float, k1: float, share: float) -> None:
+    camera = unknown_camera(640, 360, focal * 640, is_prior=False)
+    camera.params = [focal * 640, 320.0, 180.0, k1]
+    lens = make_lens(camera)
+    if share == 0:
+        assert lens.folded is None
+        return
+    assert lens.folded is not None
+    assert lens.folded.mean() == pytest.approx(share, abs=0.003)
+    # A pixel that is seen once comes back to itself.
+    row, column = np.indices((360, 640))
+    source = np.stack(lens.maps, -1).astype(np.float64) + 0.5
+    straight = np.stack([column, row], -1) + 0.5
+    back = lens.undistort_points(source.reshape(-1, 2)).reshape(straight.shape)
+    radius = np.linalg.norm((straight - [320, 180]) / lens.pinhole.fx, axis=2)
+    turn = np.sqrt(1 / (3 * -k1))
+    assert np.abs(back - straight)[radius < 0.97 * turn].max() < 0.5
+    assert lens.folded[radius > 1.005 * turn].all()
+    assert not lens.folded[radius < 0.99 * turn].any()
+
+
 def test_a_second_coefficient_changes_nothing_by_itself() -> None:
     camera = unknown_camera(640, 480, 600.0, is_prior=False)
     camera.params = [600.0, 320.0, 240.0, -0.07]

@@ -17,8 +17,8 @@ from msgs_slam.pipelines.evaluation.truth import absolute_error
 from msgs_slam.pipelines.export.writers import write_trajectory
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.global_ba.between import pose_every_frame
-from msgs_slam.pipelines.run.files import BACKBONE, EVERY_FRAME, FRAMES, save_frames
+from msgs_slam.pipelines.global_ba.between import Placer, pose_every_frame
+from msgs_slam.pipelines.run.files import BACKBONE, EVERY_FRAME, FRAMES, LEFT_OUT, save_frames
 from msgs_slam.pipelines.types import Trajectory
 from tests.pipelines.global_ba.test_global_ba_stage import BreakOff
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames
@@ -132,3 +132,25 @@ def test_on_request_and_without_the_source_only_the_picked_frames_have_a_pose(
     assert pose_every_frame(context, model, trajectory) == {}
     assert "only the picked frames have a pose" in context.warnings[0]
     assert not EVERY_FRAME.path(context.folder).exists()
+
+
+def test_images_between_leave_out_what_the_frames_around_them_do(
+    walk: Callable, open_stage: Callable[..., StageContext], room_frames: tuple[object, list[WorldFrame]]
+) -> None:
+    made, source, model, trajectory = walk()
+    frames, shape = made.run.load(FRAMES), room_frames[1][0].rgb.shape[:2]
+    left, top = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
+    left[:, : shape[1] // 3] = top[: shape[0] // 3] = True
+    for number, mask in ((4, left), (5, top)):  # images 12 and 15
+        LEFT_OUT.save(made.run.stage("frames"), mask, frames[number].name)
+    placer = Placer(opened(open_stage(made.run, "global_ba"), source), model, trajectory)
+    for index, left_out in ((10, left), (13, left | top), (16, top)):
+        placed = placer.place(index, index / 30, [room_frames[1][index].rgb])
+        assert placed is not None
+        assert not placed.lost
+        assert np.array_equal(placer.pictures.left_out(index), left_out)
+        (column, row) = placer.pictures.features(index).xy.astype(int).T
+        assert len(row) > 50
+        assert not left_out[row, column].any()
+    placer.place(19, 19 / 30, [room_frames[1][19].rgb])
+    assert placer.pictures.left_out(19) is None

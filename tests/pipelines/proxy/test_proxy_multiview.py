@@ -1,5 +1,6 @@
 """Multi-view depth, fused depth and regions on the synthetic room, against its exact truth."""
 
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
@@ -14,6 +15,7 @@ from msgs_slam.formats.images import write_grey_png
 from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.depth.fused import FusedDepth, fuse, sharpen_steps
 from msgs_slam.pipelines.depth.scale import measure_scale
+from msgs_slam.pipelines.depth.stereo import provider as stereo_provider
 from msgs_slam.pipelines.depth.stereo.neighbours import depth_range
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.labels.segments import SegmentLabels
@@ -84,6 +86,24 @@ def test_two_threads_may_ask_for_depths_at_once(room: Room, stereo: MultiviewDep
         for own, found in zip(alone, pool.map(fresh.estimate, room.frames[:6]), strict=True):
             np.testing.assert_array_equal(own.depth, found.depth)
             np.testing.assert_array_equal(own.confidence, found.confidence)
+
+
+def test_both_rounds_of_completion_ask_the_same_views_where_one_is_missing(
+    room: Room, stereo: MultiviewDepth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fresh = MultiviewDepth(room.sequence(), SIDE, PLANES, lambda: tmp_path, 2, SilentProgress())
+    missing = room.frames[int(fresh._neighbours(4, 3)[1])]
+    for file in stereo._folder().iterdir():
+        if file.name != stereo._path(missing.id).name:
+            shutil.copy(file, tmp_path)
+    asked: list[list[np.ndarray]] = []
+    monkeypatch.setattr(stereo_provider, "gather_case", lambda own, lenders, lent, warps: asked.append(warps) or True)
+    monkeypatch.setattr(stereo_provider, "ask_again", lambda case, others, warps: asked.append(warps))
+    monkeypatch.setattr(fresh, "_completed", lambda index: index)
+    fresh.case(4)
+    assert len(asked) == 2
+    assert len(asked[0]) == len(asked[1]) == min(6, len(room.frames) - 2)
+    np.testing.assert_array_equal(asked[0], asked[1])
 
 
 def test_multiview_without_parallax_says_so(room: Room) -> None:

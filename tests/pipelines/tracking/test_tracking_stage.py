@@ -19,7 +19,7 @@ from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, DEPTH_FIELDS, FRAMES, GIVEN_POSES, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.sfm.retrieval import describe
-from msgs_slam.pipelines.tracking import adjust, pictures, stage
+from msgs_slam.pipelines.tracking import adjust, pictures, segments, stage
 from msgs_slam.pipelines.tracking.stage import run as run_tracking
 from msgs_slam.pipelines.tracking.stage import stretches
 from msgs_slam.pipelines.tracking.state import TrackState
@@ -70,22 +70,46 @@ def test_given_poses_of_which_no_frame_could_be_posed_are_no_motion(
         run_tracking(open_stage(made.run, "tracking"))
 
 
-@pytest.mark.parametrize(("memory", "described"), [(1e9, 2), (0.0, 4)])
-def test_global_descriptors_are_kept_only_while_there_is_memory_for_them(
-    tmp_path: Path, make_run: Callable[..., MadeRun], monkeypatch: pytest.MonkeyPatch, memory: float, described: int
-) -> None:
-    made, count = make_run(tmp_path / "run"), 0
+def test_a_keyframe_is_described_once_however_often_frames_are_compared_with_it(
+    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Also where few of them have room in memory; for each is read, which takes milliseconds."""
+    made, described = make_run(tmp_path / "run"), []
 
     def counted(*given: Any) -> np.ndarray:
-        nonlocal count
-        count += 1
+        described.append(len(described))
         return describe(*given)
 
     monkeypatch.setattr(pictures, "describe", counted)
-    looked_up = pictures.Pictures(made.run, Config().frames, memory)
-    first, *_ = (looked_up.descriptor(i) for i in (0, 3, 0, 3))
-    assert count == described
-    assert np.array_equal(first, looked_up.descriptor(0))
+    context = open_stage(made.run, "tracking")
+    looked_up = pictures.Pictures(made.run, context.config.frames)
+    keyframes = list(range(0, 24, 2))
+    first = looked_up.similarities(looked_up.descriptor(1)[None], keyframes)
+    for _ in range(3):
+        assert np.array_equal(looked_up.similarities(looked_up.descriptor(1)[None], keyframes), first)
+    assert len(described) == len(keyframes) + 4
+    exact = [[float(looked_up.descriptor(1) @ looked_up.descriptor(k)) for k in keyframes]]
+    assert 0 < np.abs(first - exact).max() < 1e-4
+
+
+def test_stretches_are_compared_again_only_with_what_has_joined_since(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Segment 2 is recognised at once, 3 only after 4, the others never."""
+    state, asked = TrackState(), []
+    sizes = {0: 9, 1: 8, 2: 7, 3: 6, 4: 5, 5: 4}
+    state.segment = {100 * s + n: s for s, count in sizes.items() for n in range(count)}
+
+    def join(segment: int, main: int, state: TrackState, *_: Any) -> bool:
+        asked.append(segment)
+        if segment not in (2, 4) and not (segment == 3 and 4 not in state.segment.values()):
+            return False
+        state.segment = {i: main if s == segment else s for i, s in state.segment.items()}
+        return True
+
+    monkeypatch.setattr(segments, "_join", join)
+    assert segments.join_segments(state, None, 0) == 3  # type: ignore[arg-type]
+    assert asked == [1, 2, 3, 4, 5, 1, 3, 5, 1]
+    assert set(state.segment.values()) == {0, 1, 5}
 
 
 def test_sparse_model_reprojects_and_scales_are_right(
