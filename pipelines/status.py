@@ -224,7 +224,9 @@ def expected_mb(stage: str, run: RunFolder, config: Config) -> float | None:
     of_part = min(GAUSSIANS * keyframes / parts * small.width * small.height / 1e6, config.mapping.max_gaussians)
     least, a_million_pixels, a_keyframe, a_million_gaussians = NEEDS[stage]
     gaussians = of_part * (1 if stage == "mapping" else parts) / 1e6
-    pixels = camera.width * camera.height / 1e6
+    side = max(config.proxy.max_side, config.proxy.stereo_side)  # the largest that `proxy` has in work
+    worked_on = camera.at_most(side) if stage == "proxy" else camera
+    pixels = worked_on.width * worked_on.height / 1e6
     window = windows_of(keyframes, window_size(config.run.memory_mb, camera.width * camera.height))[0]
     at_once = {"frames": len(window), "tracking": ALIGNED_TOGETHER}
     inside = min(keyframes, at_once.get(stage, keyframes))
