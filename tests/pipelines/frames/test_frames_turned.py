@@ -127,4 +127,4 @@ def test_pieces_of_what_moves_join_over_the_same_gap() -> None:
     level, upright = _things(evidence, 0.03, None), _things(np.ascontiguousarray(evidence.T), 0.03, None)
     assert level[45, 64]
     assert upright[64, 45]
-    assert (upright.T != level).sum() < 20  # OpenCV's disc is not quite as wide as high
+    assert (level != upright.T).sum() < 20  # OpenCV's disc is not quite as wide as high
