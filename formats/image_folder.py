@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
-from .images import IMAGE_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES, exif_time, read_rgb
+from .images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, VIDEO_SUFFIXES, exif_time, read_rgb
 from .reading import reaching
 from .textfile import is_number, read_rows
 
@@ -36,6 +36,16 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(images, key=lambda p: natural_key(p.name))
 
 
+def unread_images(folder: Path) -> list[Path]:
+    """List the images directly in `folder` of a format that is not read, in natural order; those that lie there under
+    the same name in one that is read (a camera's raw file beside its JPEG) are not missed."""
+    with reaching(folder):
+        files = [p for p in folder.iterdir() if not p.name.startswith(".") and p.is_file()]
+    read = {p.stem.lower() for p in files if p.suffix.lower() in IMAGE_SUFFIXES}
+    unread = [p for p in files if p.suffix.lower() in UNREAD_SUFFIXES and p.stem.lower() not in read]
+    return sorted(unread, key=lambda p: natural_key(p.name))
+
+
 def count_images(folder: Path) -> int:
     """Count the image files directly in a folder, hidden ones left out; 0 where there is no such folder."""
     try:
@@ -53,9 +63,9 @@ def hint_at_inner_folder(folder: Path, least: int = 2) -> str:
 
 
 def _why_no_images(folder: Path, files: list[Path]) -> str:
-    raw = sorted({p.suffix.lower() for p in files} & RAW_SUFFIXES)
-    if raw:
-        return f"no readable image in {folder}: {', '.join(raw)} files are not supported, export them as JPEG first"
+    unread = sorted({p.suffix.lower() for p in files} & UNREAD_SUFFIXES)
+    if unread:
+        return f"no readable image in {folder}: {', '.join(unread)} files are not supported, export them as JPEG first"
     videos = sorted(p.name for p in files if p.suffix.lower() in VIDEO_SUFFIXES)
     if videos:
         more = f"{len(videos)} videos, such as {videos[0]}" if videos[1:] else f"the video {videos[0]}"

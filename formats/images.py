@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from .atomic import write_bytes
+from .colours import UnusableProfile, has_other_colours, in_srgb
 from .errors import InputError
 from .exif import ANTICLOCKWISE, QUARTER_TURNS, TURNS, ExifLens, lens_of, place_of
 from .reading import opened, parsing, read_bytes
@@ -22,7 +23,11 @@ from .reading import opened, parsing, read_bytes
 MAX_IMAGE_PIXELS = 120_000_000
 """A larger image is refused by its header, before memory is spent on it (phones go to 108 million)."""
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif"})
+IMAGE_SUFFIXES = frozenset(
+    {
+        ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif", ".hif", ".avif",
+    }
+)  # fmt: skip
 VIDEO_SUFFIXES = frozenset(
     {
     ".264", ".265", ".360", ".3g2", ".3gp", ".asf", ".avi", ".divx", ".dv", ".flv", ".gif", ".h264", ".h265", ".hevc",
@@ -34,12 +39,32 @@ _WHOLE_RANGE = 0.0, 65535.0
 _OPAQUE_FROM = 128
 """Of 255: a pixel that is less opaque shows mostly what is not in the image."""
 _ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
-_FORMATS = ("JPEG", "PNG", "BMP", "DIB", "TIFF", "WEBP", "GIF", "HEIF")
+_FORMATS = ("JPEG", "PNG", "BMP", "DIB", "TIFF", "WEBP", "GIF", "HEIF", "AVIF")
 _PLAIN_FORMATS = ("JPEG", "MPO", "PNG")
 _SEVERAL_IMAGES = ("TIFF", "WEBP", "PNG", "GIF")
+SRGB, OTHER, UNUSABLE = "sRGB", "by a profile", "by an unusable profile"
 _ADVICE = "copy it again or remove it"
-RAW_SUFFIXES = frozenset({".dng", ".cr2", ".nef", ".arw", ".raw"})
+RAW_SUFFIXES = frozenset(
+    {
+        ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".gpr", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf",
+        ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f",
+    }
+)  # fmt: skip
 """Of photos that are not read: raw sensor data."""
+UNREAD_SUFFIXES = RAW_SUFFIXES | {
+    ".jxl",
+    ".jp2",
+    ".j2k",
+    ".jxr",
+    ".exr",
+    ".hdr",
+    ".psd",
+    ".tga",
+    ".ppm",
+    ".pgm",
+    ".pnm",
+}
+"""Of all images that are not read."""
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -68,12 +93,14 @@ def is_depth_map(path: Path) -> bool:
 
 def is_plain(path: Path) -> bool:
     """Return whether other programs see the image as it is seen here: a JPEG or PNG, whatever it is called, neither
-    turned nor transparent, 8 bits a channel.
+    turned nor transparent, 8 bits a channel, in sRGB.
 
     Raises InputError as `read_rgb` does.
     """
     with _opened(Path(path)) as image:
-        return image.format in _PLAIN_FORMATS and image.mode in ("RGB", "L") and _orientation(image) == 1
+        if image.format not in _PLAIN_FORMATS or image.mode not in ("RGB", "L") or _orientation(image) != 1:
+            return False
+        return _colours(image) == SRGB
 
 
 @dataclass(frozen=True)
@@ -92,8 +119,8 @@ AS_STATED = Reading()
 
 
 def read_rgb(path: Path, reading: Reading = AS_STATED) -> NDArray[np.uint8]:
-    """Read (H, W, 3) uint8 RGB, turned upright as EXIF or HEIF says; more bits become 8, grey is tripled, alpha
-    dropped.
+    """Read (H, W, 3) uint8 sRGB, turned upright as EXIF or HEIF says; more bits become 8, grey is tripled, alpha
+    dropped, and colours of another profile converted.
 
     Raises InputError for a missing, truncated, oversized or unreadable file.
     """
@@ -101,7 +128,9 @@ def read_rgb(path: Path, reading: Reading = AS_STATED) -> NDArray[np.uint8]:
         is_wide = reading.span is not None and is_deep_colour(image)  # first: asking a PNG for EXIF loads it
         turn = _turn(image, reading)
         if is_wide and reading.span is not None:
+            profile = image.info.get("icc_profile")
             image = Image.fromarray(_scaled(decode_16_bits(read_bytes(Path(path))), reading.span))
+            image.info["icc_profile"] = profile
         image.load()
         return to_rgb8(image if turn is None else image.transpose(turn), reading.span)
 
@@ -188,7 +217,7 @@ def _encoded(image: Image.Image, **options: Any) -> bytes:
 
 def decode_rgb(data: bytes, name: str) -> NDArray[np.uint8]:
     """Decode an image held in memory as `read_rgb` does; `name` is what errors call it."""
-    with parsing(name, "image", _ADVICE), _quiet_open(io.BytesIO(data)) as image:
+    with parsing(name, "image", _ADVICE), _quiet_open(io.BytesIO(data), name) as image:
         _require_sane_size(image, name)
         return to_rgb8(image)
 
@@ -196,13 +225,14 @@ def decode_rgb(data: bytes, name: str) -> NDArray[np.uint8]:
 @dataclass(frozen=True)
 class Header:
     """An image's size (width, height) as stored, the orientation that EXIF states (1 to 8), the lens; whether it has
-    more than 8 bits a channel, and how many images the file holds."""
+    more than 8 bits a channel, how many images the file holds, and its colours: SRGB, OTHER or UNUSABLE."""
 
     stored: tuple[int, int]
     orientation: int
     lens: ExifLens
     is_deep: bool = False
     images: int = 1
+    colours: str = SRGB
 
     @property
     def size(self) -> tuple[int, int]:
@@ -218,7 +248,7 @@ def read_header(path: Path) -> Header:
         images = int(getattr(image, "n_frames", 1)) if image.format in _SEVERAL_IMAGES else 1
         before = _turned_before(image)
         stored = image.size[::-1] if before >= 5 else image.size
-        return Header(stored, _orientation(image) if before == 1 else before, lens, deep, images)
+        return Header(stored, _orientation(image) if before == 1 else before, lens, deep, images, _colours(image))
 
 
 def exif_time(path: Path) -> float | None:
@@ -242,6 +272,13 @@ def exif_gps(path: Path) -> tuple[float, float, float] | None:
     with _opened(Path(path)) as image:
         tags = _tags(image, ExifTags.IFD.GPSInfo)
     return place_of(tags)
+
+
+def _colours(image: Image.Image) -> str:
+    try:
+        return OTHER if has_other_colours(image) else SRGB
+    except UnusableProfile:
+        return UNUSABLE
 
 
 def _turn(image: Image.Image, reading: Reading) -> Image.Transpose | None:
@@ -290,12 +327,12 @@ def _read_one_channel(path: Path, what: str) -> NDArray:
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
     """An image whose header is read and checked; whatever goes wrong inside the block is explained."""
-    with opened(path) as file, parsing(path, "image", _ADVICE), _quiet_open(file) as image:
+    with opened(path) as file, parsing(path, "image", _ADVICE), _quiet_open(file, str(path)) as image:
         _require_sane_size(image, str(path))
         yield image
 
 
-def _quiet_open(file: IO[bytes]) -> Image.Image:
+def _quiet_open(file: IO[bytes], name: str) -> Image.Image:
     from pillow_heif import register_heif_opener  # takes as long to import as all the rest of a command that opens none
 
     register_heif_opener()
@@ -303,20 +340,26 @@ def _quiet_open(file: IO[bytes]) -> Image.Image:
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit follows
         try:
             return Image.open(file, formats=_FORMATS)
+        except Image.DecompressionBombError:
+            raise _too_large(name) from None
         except UnidentifiedImageError:  # whose own text shows Python's file object
             raise ValueError("its header is of no image format that can be read here") from None
 
 
 def _require_sane_size(image: Image.Image, name: str) -> None:
-    width, height = image.size
-    if width * height > MAX_IMAGE_PIXELS:
-        raise InputError(
-            f"{name} is {width}x{height}, over the limit of {MAX_IMAGE_PIXELS / 1e6:.0f} million pixels: scale it down"
-        )
+    if image.width * image.height > MAX_IMAGE_PIXELS:
+        raise _too_large(name, f" ({image.width}x{image.height})")
+
+
+def _too_large(name: str, size: str = "") -> InputError:
+    return InputError(
+        f"{name}{size} is over the limit of {MAX_IMAGE_PIXELS / 1e6:.0f} million pixels: scale it down, or set the "
+        "camera to fewer"
+    )
 
 
 def to_rgb8(image: Image.Image, span: tuple[float, float] | None = None) -> NDArray[np.uint8]:
-    """Return (H, W, 3) uint8 RGB of a loaded image; grey is tripled, alpha dropped.
+    """Return (H, W, 3) uint8 sRGB of a loaded image, by its colour profile; grey is tripled, alpha dropped.
 
     `span`: the values of a deep image that become 0 and 255, by default those of 16 bits (of floats the image's own).
     What is not finite becomes 0. Raises ValueError for a pixel format that has no conversion.
@@ -325,13 +368,7 @@ def to_rgb8(image: Image.Image, span: tuple[float, float] | None = None) -> NDAr
     if deep is not None:
         scaled = _scaled(deep, _default_span(deep) if span is None else span)
         return scaled if scaled.ndim == 3 else np.repeat(scaled[:, :, None], 3, axis=2)
-    if image.mode == "RGB":
-        return np.array(image, dtype=np.uint8)
-    if image.mode in ("CMYK", "LAB"):
-        return np.array(_by_profile(image), dtype=np.uint8)
-    if "transparency" in image.info or image.mode in _ALPHA_MODES:
-        image = image.convert("RGBA")  # the only way that Pillow goes from all of them
-    return np.array(image.convert("RGB"), dtype=np.uint8)
+    return np.array(in_srgb(image), dtype=np.uint8)
 
 
 def transparent_pixels(image: Image.Image) -> NDArray[np.bool_] | None:
@@ -383,30 +420,6 @@ def _scaled(values: NDArray, span: tuple[float, float]) -> NDArray[np.uint8]:
         return (np.clip(values, 0, 65535).astype(np.uint16) >> 8).astype(np.uint8)
     known = np.nan_to_num(values.astype(np.float32), nan=low, posinf=high, neginf=low)
     return np.asarray(((known - low) / max(high - low, 1e-12) * 255).clip(0, 255).round().astype(np.uint8))
-
-
-def _by_profile(image: Image.Image) -> Image.Image:
-    """CMYK by the image's own colour profile, if it has a usable one; LAB as the standard defines it."""
-    from PIL import ImageCms
-
-    rgb = ImageCms.createProfile("sRGB")
-    if image.mode == "LAB":
-        return _transformed(image, ImageCms.createProfile("LAB"), rgb)
-    if profile := image.info.get("icc_profile"):
-        try:
-            return _transformed(image, ImageCms.ImageCmsProfile(io.BytesIO(profile)), rgb)
-        except (ImageCms.PyCMSError, OSError):
-            pass  # a damaged profile, or one of another colour space
-    return image.convert("RGB")
-
-
-def _transformed(image: Image.Image, source: object, target: object) -> Image.Image:
-    from PIL import ImageCms
-
-    made = ImageCms.profileToProfile(image, source, target, outputMode="RGB")  # type: ignore[arg-type]
-    if made is None:
-        raise ValueError(f"its colours ({image.mode}) cannot be converted")
-    return made
 
 
 def to_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

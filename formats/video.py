@@ -6,8 +6,6 @@ import itertools
 import math
 import os
 import shlex
-import statistics
-import struct
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,15 +24,9 @@ import cv2
 from .errors import InputError, install_command
 from .images import IMAGE_SUFFIXES
 from .reading import opened, require_unicode
-from .video_streams import (
-    AvCapture,
-    as_opencv_writes_them,
-    has_pyav,
-    hdr_transfer,
-    is_interlaced,
-    read_moov,
-    unreadable,
-)
+from .video_clock import Clock, longest_step
+from .video_head import Track, main_track, read_tracks
+from .video_streams import AvCapture, StreamFacts, as_opencv_writes_them, has_pyav, read_facts, unreadable
 
 _SQUARE = 0.002
 """Sides that differ by less come from a size that was rounded to whole pixels."""
@@ -49,7 +41,10 @@ _SNIFFED_BYTES = 4096
 _UNKNOWN_RATE = 30.0
 _MAX_RATE = 10_000.0
 """A larger one is a clock's unit and no number of frames a second."""
-_SHORTEST_STEP = 1e-6
+_FEWEST_BYTES = 4
+"""Of a frame: a header that declares more frames than the file can hold says nothing."""
+_WHOLE = 0.98
+"""Of the time that a header states, a file that is not cut off has so much."""
 _FIRST_FRAMES = 8
 """Decoded before to see whether a video is interlaced."""
 _DOUBTED_FRAMES = 1000
@@ -106,12 +101,14 @@ class VideoReader(Iterator[VideoFrame]):
 
     `wanted` says by index (a set, a range or a function) which frames to hand out, None for all; the others are
     decoded but not converted to RGB. A turn or mirroring stated in the file is applied, and pixels that are no squares
-    are stretched to such. Timestamps are those of the container, so a variable rate is kept; where they are missing or
-    go back they are repaired to increase strictly.
+    are stretched to such. Timestamps are those of the container, so a variable rate is kept; where they are missing, go
+    back or jump they are repaired to increase strictly.
+
+    Of `tracks` (of MP4 and Matroska) number `track` is read: without PyAV always the first, and `main_track` otherwise.
 
     After the end `timestamps` holds the time of every decoded frame and `missing_frames` how many frames the header
-    promised beyond those: more than a few mean a truncated or damaged file. `repaired_timestamps` counts the repairs,
-    `blank_frames` those wanted that show one flat colour and were left out (a fade, or a picture never decoded).
+    promised beyond those. `repaired_timestamps` counts the repairs, `restarts` the places where the stored clock begins
+    anew, `blank_frames` those wanted that show one flat colour and were left out (a fade, or a picture never decoded).
     `hdr` is "HLG" or "PQ" where the file says so, `tone_mapped` whether its frames are then brought to sRGB;
     `interlaced` whether frames are deinterlaced.
 
@@ -121,16 +118,22 @@ class VideoReader(Iterator[VideoFrame]):
 
     def __init__(self, path: Path, wanted: Callable[[int], bool] | Container[int] | None = None) -> None:
         self._path = Path(path)
-        _require_video_bytes(self._path)
+        head = _read_video_bytes(self._path)
         self._wanted = _as_predicate(wanted)
-        self.hdr = hdr_transfer(self._path)
+        self.tracks = read_tracks(self._path)
+        self.track = main_track(self.tracks) if has_pyav() else 0
+        stated = self.tracks[self.track] if self.tracks else Track(0, 0)
+        facts = read_facts(self._path, _FIRST_FRAMES, self.track) if has_pyav() else StreamFacts()
+        self.has_alpha = stated.has_alpha
+        self.hdr = stated.transfer or facts.transfer
         self.tone_mapped = bool(self.hdr) and has_pyav()
-        self.interlaced = has_pyav() and is_interlaced(self._path, _FIRST_FRAMES)
+        self.interlaced = facts.is_interlaced
         self._capture = self._first_grabbed()
         self._is_grabbed = True
-        self.display = _read_display(self._capture, self._path)
-        self.info = _read_info(self._capture, self._path, self.display)
-        self._clock = _Clock(self.info.fps)
+        self.display = _read_display(self._capture, stated)
+        self.info = _read_info(self._capture, self._path, self.display, stated)
+        self._has_counted = stated.samples > 0 or head.startswith(b"RIFF")
+        self._clock = Clock(self.info.fps, longest_step(head))
         self._last: NDArray | None = None
         self._is_trusted = False
         self.ended = False
@@ -138,8 +141,8 @@ class VideoReader(Iterator[VideoFrame]):
 
     def _first_grabbed(self) -> cv2.VideoCapture | AvCapture:
         """The decoder after its first frame: PyAV where OpenCV would fail and it is there."""
-        if self.tone_mapped or self.interlaced:
-            by_pyav = AvCapture(self._path, self.hdr, self.interlaced)
+        if self.tone_mapped or self.interlaced or self.track:
+            by_pyav = AvCapture(self._path, self.hdr, self.interlaced, self.track)
             if self.interlaced and by_pyav.codec == "hevc":
                 raise unreadable(self._path, by_pyav.codec)
             if by_pyav.isOpened() and by_pyav.grab():
@@ -164,9 +167,25 @@ class VideoReader(Iterator[VideoFrame]):
         return self._clock.repairs
 
     @property
+    def restarts(self) -> int:
+        """Places where the stored clock begins anew or jumps, and goes on from there."""
+        return self._clock.restarts
+
+    @property
     def missing_frames(self) -> int:
         """Frames that the header claims and the file does not deliver; 0 before the end."""
         return max(0, self.info.frame_count_claimed - len(self._clock.times)) if self.ended else 0
+
+    @property
+    def is_truncated(self) -> bool:
+        """Whether more is missing than containers count too many in passing; False before the end.
+
+        Most containers state no number of frames but how long they last: then frames that go on to that end are all.
+        """
+        claimed = self.info.frame_count_claimed
+        if self.missing_frames <= max(2, claimed // 50) or self.restarts:
+            return False
+        return self._has_counted or self._clock.times[-1] < _WHOLE * (claimed - 1) / self.info.fps
 
     def __next__(self) -> VideoFrame:
         while self._is_grabbed or self._capture.grab():
@@ -196,7 +215,7 @@ class VideoReader(Iterator[VideoFrame]):
         if self._is_trusted or index > _DOUBTED_FRAMES or isinstance(self._capture, AvCapture):
             return
         self._is_trusted = True
-        if is_interlaced(self._path, index + 1):
+        if read_facts(self._path, index + 1).is_interlaced:
             raise unreadable(self._path, _codec(self._capture), index)
 
     def close(self) -> None:
@@ -210,42 +229,6 @@ class VideoReader(Iterator[VideoFrame]):
         self.close()
 
 
-class _Clock:
-    """Container times made strictly increasing, with the first frame at 0."""
-
-    def __init__(self, fps: float) -> None:
-        self.times: list[float] = []
-        self.repairs = 0
-        self._nominal_step = 1.0 / fps
-        self._last_stored: float | None = None
-        self._start = 0.0
-
-    def next(self, stored: float) -> float:
-        """Return the time of the next frame, given what the container says (any float, NaN and negative included)."""
-        if not self.times:
-            self._start = stored if math.isfinite(stored) else 0.0
-            time = 0.0
-        else:
-            time = self._after(stored)
-        self._last_stored = stored if math.isfinite(stored) else self._last_stored
-        self.times.append(time)
-        return time
-
-    def _after(self, stored: float) -> float:
-        previous = self.times[-1]
-        if math.isfinite(stored) and stored - self._start > previous + _SHORTEST_STEP:
-            return stored - self._start
-        self.repairs += 1
-        # Where the stored clock was set back once and runs on from there, its steps are still good.
-        step = stored - self._last_stored if self._last_stored is not None else 0.0
-        return previous + (step if math.isfinite(step) and step > _SHORTEST_STEP else self._typical_step())
-
-    def _typical_step(self) -> float:
-        recent = self.times[-16:]
-        steps = [b - a for a, b in itertools.pairwise(recent)]
-        return statistics.median(steps) if steps else self._nominal_step
-
-
 def _as_predicate(wanted: Callable[[int], bool] | Container[int] | None) -> Callable[[int], bool]:
     if wanted is None:
         return lambda index: True
@@ -254,8 +237,8 @@ def _as_predicate(wanted: Callable[[int], bool] | Container[int] | None) -> Call
     return wanted.__contains__
 
 
-def _require_video_bytes(path: Path) -> None:
-    """Refuse what is certainly no video before FFmpeg sees it, to say so better than FFmpeg would."""
+def _read_video_bytes(path: Path) -> bytes:
+    """The first bytes. Refuses what is certainly no video before FFmpeg sees it, to say so better than it would."""
     if path.suffix.lower() in IMAGE_SUFFIXES:
         raise InputError(f"{path} is a single image, not a video: give the folder that contains the images")
     with opened(path) as file:
@@ -265,6 +248,7 @@ def _require_video_bytes(path: Path) -> None:
         raise InputError(f"{path} is a {archive} archive, not a video: unpack it first, then give what was in it")
     if b"\0" not in head and _is_text(head):
         raise InputError(f"{path} is a text file, not a video: give a video file or a folder that holds images")
+    return head
 
 
 def _is_text(head: bytes) -> bool:
@@ -329,8 +313,8 @@ def _is_blank(image: NDArray) -> bool:
     return bool((some == image[0, 0]).all() and (image == image[0, 0]).all())
 
 
-def _read_display(capture: cv2.VideoCapture | AvCapture, path: Path) -> Display:
-    mirror = read_mirror(path)
+def _read_display(capture: cv2.VideoCapture | AvCapture, track: Track) -> Display:
+    mirror = mirror_of(track.matrix)
     if mirror.is_mirrored:
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # a decoder knows turns only, and turns such a picture by 180°
     aspect = pixel_aspect(capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN))
@@ -338,7 +322,7 @@ def _read_display(capture: cv2.VideoCapture | AvCapture, path: Path) -> Display:
     return replace(mirror, aspect=1 / aspect if is_turned else aspect)
 
 
-def _read_info(capture: cv2.VideoCapture | AvCapture, path: Path, display: Display) -> VideoInfo:
+def _read_info(capture: cv2.VideoCapture | AvCapture, path: Path, display: Display, track: Track) -> VideoInfo:
     stored = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
     if min(stored) < 1:
         raise _undecodable(path)
@@ -351,7 +335,8 @@ def _read_info(capture: cv2.VideoCapture | AvCapture, path: Path, display: Displ
     count, fps = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
     if not 0 < fps < _MAX_RATE:
         return VideoInfo(width, height, 0, _UNKNOWN_RATE)
-    return VideoInfo(width, height, int(count) if math.isfinite(count) and count > 0 else 0, fps)
+    is_possible = math.isfinite(count) and 0 < count * _FEWEST_BYTES <= path.stat().st_size
+    return VideoInfo(width, height, round(count * track.shown) if is_possible else 0, fps)
 
 
 def _as_rgb8(decoded: NDArray) -> NDArray[np.uint8]:
@@ -393,23 +378,15 @@ class Display:
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
 
 
-def read_mirror(path: Path) -> Display:
-    """Read the Display of an MP4 or MOV whose track header (ISO/IEC 14496-12, 8.3.2) mirrors the picture; for all other
-    files, and where it only turns, which decoders do, one that leaves all as it is."""
-    for track in read_moov(path).split(b"trak")[1:]:
-        head = track.find(b"tkhd")
-        if head < 0 or b"vide" not in track:
-            continue
-        start = head + 4 + (52 if track[head + 4 : head + 5] == b"\1" else 40)
-        if len(track) < start + 20:
-            continue
-        a, b, _, c, d = struct.unpack(">5i", track[start : start + 20])  # x' = a x + c y, y' = b x + d y
-        if a * d - b * c < 0:
-            swaps = abs(a) < abs(b)
-            across, down = (c, b) if swaps else (a, d)
-            return Display(swaps, (1 if across > 0 else -1, 1 if down > 0 else -1))
+def mirror_of(matrix: tuple[int, int, int, int]) -> Display:
+    """Return the Display of a matrix (a, b, c, d; see `Track`) that mirrors the picture; one that leaves all as it is
+    where it only turns, which decoders do."""
+    a, b, c, d = matrix
+    if a * d - b * c >= 0:
         return Display()
-    return Display()
+    swaps = abs(a) < abs(b)
+    across, down = (c, b) if swaps else (a, d)
+    return Display(swaps, (1 if across > 0 else -1, 1 if down > 0 else -1))
 
 
 def pixel_aspect(wide: float, high: float) -> float:

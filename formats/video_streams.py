@@ -1,30 +1,29 @@
-"""What OpenCV does not do for a video: read its boxes (panorama, HDR), find interlaced streams, and decode by PyAV.
+"""What OpenCV does not do for a video: find interlaced streams, and decode by PyAV.
 
-PyAV reads HDR (HLG, PQ), which OpenCV's decoder cuts to 8 flat bits, codecs that OpenCV does not have, and interlaced
-video: each frame holds two fields (half pictures) of different times, or is one. OpenCV's FFmpeg (from OpenCV 4.13 on)
-cannot convert such frames, and does not say so: it hands out whatever its buffer held before, black, the last frame, or
-a picture of another video."""
+PyAV reads HDR (HLG, PQ), which OpenCV's decoder cuts to 8 flat bits, codecs that OpenCV does not have, tracks behind
+the first, and interlaced video: each frame holds two fields (half pictures) of different times, or is one. OpenCV's
+FFmpeg (from OpenCV 4.13 on) cannot convert such frames, and does not say so: it hands out whatever its buffer held
+before, black, the last frame, or a picture of another video."""
 
 import contextlib
 import functools
 import itertools
 import os
-import re
 import shlex
-import struct
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
+from .colours import RGB_FROM_2020, srgb_of
 from .errors import InputError, install_command
-from .reading import parsing
+from .video_head import TRANSFERS
 
 # The containers of one video each. Left out is what names other files (playlists, scripts, numbered images) or is made
 # into images by FFmpeg (text): such a file would show files from elsewhere on this disk, whatever it is called.
@@ -44,35 +43,16 @@ _LISTEN = (
     "for _ in range(int(sys.argv[2])): capture.read()"
 )
 
-WHOLE, PART = "equirectangular", "part of a sphere"
-_MAX_MOOV_BYTES = 64 << 20
-_MAX_BOXES = 10_000
-_FIRST_BOXES = (b"ftyp", b"styp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot", b"uuid")
-"""One of these is at the start of an MP4 or MOV; a raw stream of H.264 or HEVC looks like a box of another kind."""
-_PROJECTION = re.compile(rb"ProjectionType\W{1,4}([a-z]+)")
-_SECOND_EYE = re.compile(rb"GSpherical:StereoMode>\s*(?!mono)\w")
-
-_TRANSFERS = {16: "PQ", 18: "HLG"}  # ITU-T H.273, table 3
 _KNEE = 0.75
 """Up to this part of diffuse white light stays as it is; all that is brighter shares the rest."""
-_709_FROM_2020 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
-"""Linear RGB, ITU-R BT.2087."""
-_FINE = 1 << 14
-
-
-def hdr_transfer(path: Path) -> str:
-    """Return "HLG" or "PQ" where an MP4 or MOV says so in its colr box; "" for all else."""
-    moov = read_moov(path)
-    place = moov.find(b"colrnclx")
-    return _TRANSFERS.get(int.from_bytes(moov[place + 10 : place + 12], "big"), "") if place >= 0 else ""
 
 
 class AvCapture:
-    """Reader by PyAV with the part of OpenCV's VideoCapture that is used here: for HDR (`transfer` as `hdr_transfer`
-    says), whose frames are tone-mapped; for interlaced video, which is deinterlaced to as many frames as it has; and
-    for codecs that OpenCV cannot decode. What cannot be opened has no frame."""
+    """Reader by PyAV with the part of OpenCV's VideoCapture that is used here: for HDR (`transfer` "HLG" or "PQ"),
+    whose frames are tone-mapped; for interlaced video, which is deinterlaced to as many frames as it has; for a video
+    track that is not the first; and for codecs that OpenCV cannot decode. What cannot be opened has no frame."""
 
-    def __init__(self, path: Path, transfer: str = "", interlaced: bool = False) -> None:
+    def __init__(self, path: Path, transfer: str = "", interlaced: bool = False, track: int = 0) -> None:
         import av
 
         self._transfer, self._turns = transfer, True
@@ -82,7 +62,7 @@ class AvCapture:
         self._frames: Iterator[Any] = iter(())
         try:
             self._container = av.open(str(path), options=OPEN_OPTIONS)
-            self._stream = self._container.streams.video[0]
+            self._stream = self._container.streams.video[track]
             self._stream.thread_type = "AUTO"
             self.codec = self._stream.codec_context.name
         except (av.FFmpegError, OSError, ValueError, IndexError):
@@ -194,12 +174,12 @@ def tone_mapped(rgb: NDArray[np.uint16], transfer: str) -> NDArray[np.uint8]:
     Diffuse white (ITU-R BT.2408: 203 cd/m2 in PQ, 75 % in HLG, whose light is taken as the scene's) stays near white;
     above `_KNEE` the largest channel bends towards 1 and takes the others along, so that hues stay.
     """
-    light = cv2.transform(_light(transfer)[rgb], _709_FROM_2020.astype(np.float32)).clip(0)
+    light = cv2.transform(_light(transfer)[rgb], RGB_FROM_2020.astype(np.float32)).clip(0)
     largest = light.max(axis=2, keepdims=True)
     over = (largest - _KNEE).clip(0) / (1 - _KNEE)
     bent = np.minimum(largest, _KNEE) + (1 - _KNEE) * over / (1 + over)
     light *= bent / np.maximum(largest, np.float32(1e-6))
-    return _srgb()[(light * (_FINE - 1) + 0.5).astype(np.uint16).clip(0, _FINE - 1)]
+    return srgb_of(light)
 
 
 @functools.cache
@@ -215,64 +195,6 @@ def _light(transfer: str) -> NDArray[np.float32]:
     return (10000 / 203 * ((root - c1).clip(0) / (c2 - c3 * root)) ** (1 / m1)).astype(np.float32)
 
 
-@functools.cache
-def _srgb() -> NDArray[np.uint8]:
-    """(_FINE,) sRGB's byte of light 0..1 (IEC 61966-2-1)."""
-    light = np.arange(_FINE) / (_FINE - 1)
-    curved = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return np.round(curved * 255).astype(np.uint8)
-
-
-def read_moov(path: Path) -> bytes:
-    """Read the head of an MP4 or MOV, at most 64 MB of it; nothing for any other file, or where a length is damaged."""
-    end = path.stat().st_size
-    with open(path, "rb") as file:
-        for _ in range(_MAX_BOXES):
-            start = file.tell()
-            head = file.read(8)
-            size, kind = struct.unpack(">I4s", head) if len(head) == 8 else (0, b"")
-            if start == 0 and kind not in _FIRST_BOXES:
-                break
-            if size == 1:
-                size = int.from_bytes(file.read(8), "big")
-            if kind == b"moov":
-                return file.read(min(max(0, start + size - file.tell()), _MAX_MOOV_BYTES))
-            if size < file.tell() - start or start + size >= end:
-                break
-            file.seek(start + size)
-    return b""
-
-
-def video_sphere(path: Path) -> str:
-    """Return WHOLE, PART (one eye of two, half a sphere, a cube map) or "" for what says nothing of the kind.
-
-    By the boxes of the Spherical Video RFC (github.com/google/spatial-media): its second version's `st3d` and `sv3d`,
-    or the XML of its first.
-    """
-    moov = read_moov(path)
-    if (place := moov.find(b"sv3d")) >= 0:
-        whole = moov.find(b"equi", place)
-        # equi: version and flags, then how much is cut off at the top, bottom, left and right
-        is_whole = whole >= 0 and not any(moov[whole + 8 : whole + 24])
-        eyes = moov.find(b"st3d")
-        return WHOLE if is_whole and (eyes < 0 or moov[eyes + 8 : eyes + 9] in (b"", b"\0")) else PART
-    found = _PROJECTION.search(moov) if b"GSpherical" in moov else None
-    if found is None:
-        return ""
-    return WHOLE if found[1] == WHOLE.encode() and not _SECOND_EYE.search(moov) else PART
-
-
-def image_sphere(path: Path) -> str:
-    """Return WHOLE, PART or "" for an image, by its Photo Sphere XMP (Google), which a crop may have kept unchanged."""
-    try:
-        with parsing(path, "image"), Image.open(path) as image:
-            xmp = image.info.get("xmp", b"")
-    except InputError:
-        return ""
-    found = _PROJECTION.search(xmp if isinstance(xmp, bytes) else str(xmp).encode())
-    return "" if found is None else WHOLE if found[1] == WHOLE.encode() else PART
-
-
 def has_pyav() -> bool:
     """Return whether PyAV is there (the extra "hdr")."""
     try:
@@ -282,26 +204,37 @@ def has_pyav() -> bool:
     return True
 
 
-def is_interlaced(path: Path, frames: int) -> bool:
-    """Return whether FFmpeg takes the stream, or one of its first `frames`, for interlaced; False for what it cannot
-    read."""
-    return _by_pyav(path, frames) if has_pyav() else _by_listening(path, frames)
+@dataclass(frozen=True)
+class StreamFacts:
+    """Whether FFmpeg takes a stream, or one of its first frames, for interlaced; and "HLG" or "PQ" where the stream
+    itself says that it is HDR."""
+
+    is_interlaced: bool = False
+    transfer: str = ""
 
 
-def _by_pyav(path: Path, frames: int) -> bool:
+def read_facts(path: Path, frames: int, track: int = 0) -> StreamFacts:
+    """Read the facts of a video track from its first `frames`, by PyAV; without it, and then nothing of HDR, by what
+    FFmpeg complains of. What cannot be read has none."""
+    return _by_pyav(path, frames, track) if has_pyav() else StreamFacts(_by_listening(path, frames))
+
+
+def _by_pyav(path: Path, frames: int, track: int) -> StreamFacts:
     import av
 
     try:
         with av.open(str(path), options=OPEN_OPTIONS) as container:
-            if not container.streams.video:
-                return False
-            stream = container.streams.video[0]
+            if track >= len(container.streams.video):
+                return StreamFacts()
+            stream = container.streams.video[track]
             stream.thread_type = "AUTO"
+            transfer = TRANSFERS.get(int(stream.codec_context.color_trc), "")
             if stream.codec_context.field_order > _PROGRESSIVE:
-                return True
-            return any(frame.interlaced_frame for frame in itertools.islice(container.decode(stream), frames))
+                return StreamFacts(True, transfer)
+            first = itertools.islice(container.decode(stream), frames)
+            return StreamFacts(any(frame.interlaced_frame for frame in first), transfer)
     except (av.FFmpegError, OSError, ValueError):
-        return False
+        return StreamFacts()
 
 
 def _by_listening(path: Path, frames: int) -> bool:

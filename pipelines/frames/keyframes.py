@@ -1,6 +1,6 @@
 """Frames picked from the source, and keyframes among them by how far tracked points have moved."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 
 import cv2
@@ -17,7 +17,8 @@ from ..engine.stages import StageContext
 from ..sfm.flow import corners, follow
 from ..source.faces import Faces
 from ..source.opening import Source
-from ..source.sharpness import reduce_image, sharpest_of_windows
+from ..source.overlap import Motion
+from ..source.sharpness import reduce_image, sharpest_of_windows, sharpness
 from ..types import Frame
 from .masks import picked
 
@@ -103,7 +104,10 @@ class _Tracker:
 
 
 def pick_frames(context: StageContext, source: Source, faces: Faces | None) -> list[Frame]:
-    """The sharpest image of every window of time, kept in the snapshot. Raises InputError for a source of one."""
+    """The sharpest image of every window of time, and all images where these hardly overlap, kept in the snapshot.
+
+    Raises InputError for a source of one.
+    """
     table = context.snapshot / "picked.json"
     if table.exists():
         stored = read_json(table, None)
@@ -113,22 +117,44 @@ def pick_frames(context: StageContext, source: Source, faces: Faces | None) -> l
                 context.warn(message)
             return frames
     config, earlier = context.config.frames, len(context.warnings)  # those before are given again by who gave them
-    pictures = source.read(warn=context.warn)
-    pictures = context.progress.track(pictures, "picking", source.expected_frames or None)
     rate = config.rate if source.has_times else 0.0
-    frames = []
-    for picture, score in sharpest_of_windows(pictures, rate):
-        frame_id = len(frames)
-        timestamp = picture.timestamp if source.has_times else _untimed(config, frame_id)
-        name = source.name(frame_id, picture.source_index)
-        frames.append(Frame(frame_id, name, timestamp, picture.source_index, score))
-        _save_picked(context, source, picture, name, faces)
+    motion = Motion()
+    frames = _saved(context, source, faces, _sharpest(context, source, rate, motion))
+    wanted = motion.wanted() if rate > 0 else []
+    if len(wanted) > len(frames):
+        pictures = context.progress.track(source.read(set(wanted)), "picking", len(wanted))
+        frames = _saved(context, source, faces, ((p, sharpness(p.rgb)) for p in pictures))
     context.same_source()
     if len(frames) < 2:
         raise InputError(f"{source.path} gives one frame only; a reconstruction needs several views of a scene")
     if faces is not None:
         frames = _of_all_directions(frames, faces)
     write_json(table, {"frames": [asdict(f) for f in frames], "warnings": context.warnings[earlier:]})
+    return frames
+
+
+def _sharpest(context: StageContext, source: Source, rate: float, motion: Motion) -> Iterator[tuple[VideoFrame, float]]:
+    """The sharpest images with their sharpness, by whose `motion` it is judged whether these are enough."""
+    pictures = context.progress.track(source.read(warn=context.warn), "picking", source.expected_frames or None)
+    if rate <= 0:
+        yield from sharpest_of_windows(pictures, rate)
+        return
+    for picture, score in sharpest_of_windows(motion.watch(pictures), rate):
+        motion.pick(picture.source_index)
+        yield picture, score
+
+
+def _saved(
+    context: StageContext, source: Source, faces: Faces | None, chosen: Iterable[tuple[VideoFrame, float]]
+) -> list[Frame]:
+    """The frames of images with their sharpness, each written to the snapshot."""
+    frames: list[Frame] = []
+    for picture, score in chosen:
+        frame_id = len(frames)
+        timestamp = picture.timestamp if source.has_times else _untimed(context.config.frames, frame_id)
+        name = source.name(frame_id, picture.source_index)
+        frames.append(Frame(frame_id, name, timestamp, picture.source_index, score))
+        _save_picked(context, source, picture, name, faces)
     return frames
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...formats.datasets.sequence import Camera
 from ...formats.errors import InputError
-from ...formats.video_streams import PART, WHOLE, image_sphere, video_sphere
+from ...formats.video_head import PART, WHOLE, image_sphere, video_sphere
 from ..config import FramesConfig
 from ..geometry.camera import CUBE, LEVEL
 from ..sfm.lens import make_lens, to_pycolmap

@@ -1,6 +1,7 @@
 """The kinds of source, a video file, a folder of images or a data set, read alike."""
 
 import re
+import shlex
 from collections import Counter
 from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -10,13 +11,14 @@ import numpy as np
 
 from ...formats.datasets import Sequence
 from ...formats.errors import InputError, install_command
-from ...formats.image_folder import list_images, read_image_times, times_file
+from ...formats.image_folder import list_images, read_image_times, times_file, unread_images
 from ...formats.images import is_depth_map
 from ...formats.reading import file_sha256, files_sha256, opened, reaching, require_file
 from ...formats.textfile import read_text
 from ...formats.video import VideoFrame, VideoReader, probe_video
+from ...formats.video_head import main_track
 from ..run.folder import RunFolder
-from .recording import ImageSource, RecordingSource, Warn, open_recording, require_size
+from .recording import Headers, ImageSource, RecordingSource, Warn, open_recording, require_size
 
 LIST_SUFFIX = ".videos"
 _LONGEST_LIST = 100_000
@@ -92,7 +94,13 @@ class FolderSource(ImageSource):
         times = read_image_times(images)
         stamps = np.arange(len(images), dtype=np.float64) if times is None else times
         names = tuple(image.name for image in images)
-        super().__init__(Sequence("images", path, names, stamps, tuple(images), timed=times is not None))
+        notes = _notes_on_unread(path)
+        super().__init__(Sequence("images", path, names, stamps, tuple(images), timed=times is not None, notes=notes))
+
+    def _of_one_size(self, headers: Headers) -> Headers:
+        headers = headers.of_most(lambda header: (min(header.stored), max(header.stored)))
+        common = headers.common_orientation()
+        return headers if common is not None else headers.of_most(lambda header: header.size)
 
     def _require_one_camera(self) -> None:
         sizes = {name: self._size(header) for name, header in self.headers.of.items()}
@@ -116,6 +124,17 @@ def _without_depth_maps(images: list[Path]) -> list[Path]:
     """All but images of 16 bits in one channel, if there are others: some data sets keep depth beside colour."""
     depth = {path for path in images if path.suffix.lower() in (".png", ".tif", ".tiff") and is_depth_map(path)}
     return images if len(depth) == len(images) else [path for path in images if path not in depth]
+
+
+def _notes_on_unread(folder: Path) -> tuple[str, ...]:
+    unread = unread_images(folder)
+    if not unread:
+        return ()
+    kinds = ", ".join(sorted({path.suffix.lower() for path in unread}))
+    return (
+        f"{len(unread)} files of a format that is not read ({kinds}) are left out, {unread[0].name} first: export them "
+        "as JPEG or PNG",
+    )
 
 
 def open_source(path: Path, format: str = "auto") -> Source:
@@ -212,8 +231,8 @@ def _warn_of_the_file(path: Path, reader: VideoReader, warn: Warn) -> None:
     elif reader.hdr:
         fix = install_command("msgs-slam[hdr]")
         warn(f"{path.name} is HDR ({reader.hdr}), its colours will look flat. To read it in full: {fix}")
-    # Containers count a frame or two too many in passing; that is no damage.
-    if reader.missing_frames > max(2, reader.info.frame_count_claimed // 50):
+    _warn_of_the_rest(path, reader, warn)
+    if reader.is_truncated:
         warn(
             f"{path.name} is truncated: its header declares {reader.info.frame_count_claimed} frames, {decoded} "
             "decode; going on with those"
@@ -223,10 +242,40 @@ def _warn_of_the_file(path: Path, reader: VideoReader, warn: Warn) -> None:
         warn(f"{path.name}: {reader.blank_frames} frames of one flat colour (a fade, or damage) were left out")
     if reader.unreadable_frames:
         warn(f"{path.name}: {reader.unreadable_frames} damaged frames were left out")
+    _warn_of_the_clock(path, reader, warn)
+
+
+def _warn_of_the_clock(path: Path, reader: VideoReader, warn: Warn) -> None:
+    decoded = len(reader.timestamps)
     if reader.repaired_timestamps == decoded - 1 > 1:
         warn(f"{path.name} has no timestamps (a raw stream?): {reader.info.fps:g} frames a second are assumed")
     elif reader.repaired_timestamps:
         warn(f"{path.name}: {reader.repaired_timestamps} of {decoded} timestamps were missing or went back; repaired")
+    if reader.restarts:
+        warn(
+            f"{path.name}: the clock jumps or starts anew {reader.restarts} times (recordings joined to one file?); "
+            "going on with the usual time between two frames"
+        )
+
+
+def _warn_of_the_rest(path: Path, reader: VideoReader, warn: Warn) -> None:
+    """Report what the file holds beside the frames that are used: other video tracks, an alpha channel."""
+    file, main = shlex.quote(path.name), main_track(reader.tracks)
+    named = [f"track {i} ({track.width}x{track.height})" for i, track in enumerate(reader.tracks, 1)]
+    if others := [i for i in range(len(named)) if i != reader.track]:
+        wanted = main if main in others else others[0]
+        more = "" if wanted != main else f"; `{install_command('msgs-slam[hdr]')}` makes it the one that is read"
+        warn(
+            f"{path.name} holds {len(named)} video tracks: {named[reader.track]} is used, not "
+            f"{', '.join(named[i] for i in others)}. To use {named[wanted]}, copy it with "
+            f"`ffmpeg -i {file} -map 0:v:{wanted} -c copy OUT{path.suffix}`{more}"
+        )
+    if reader.has_alpha:
+        warn(
+            f"{path.name} has an alpha channel, which is not read: its background counts as part of the scene. To "
+            f"leave it out, make masks with `ffmpeg -i {file} -vf alphaextract -start_number 0 MASKS/%06d.png`, and "
+            "pass --masks MASKS"
+        )
 
 
 def _warn_of_shape(path: Path, reader: VideoReader, warn: Warn) -> None:

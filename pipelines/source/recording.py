@@ -1,10 +1,13 @@
 """Images and data sets as a source: images, times and camera as a reader gives them; whether they are of one camera, by
 all that their headers say; names of frames, and files that can serve as them unchanged."""
 
+from __future__ import annotations
+
+import itertools
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -14,16 +17,19 @@ from numpy.typing import NDArray
 from ...formats.datasets import Camera, Sequence, open_sequence, recognise_source
 from ...formats.errors import InputError
 from ...formats.exif import QUARTER_TURNS, ExifLens
-from ...formats.images import Header, Reading, is_plain, read_deep, read_header, read_rgb, read_transparent
+from ...formats.images import UNUSABLE, Header, Reading, is_plain, read_deep, read_header, read_rgb, read_transparent
 from ...formats.video import VideoFrame
 
 _ALIKE = 1.05
 """Focal lengths that differ by less are one: EXIF rounds to whole millimetres, which are 4 % of 25, and the focus moves
 the lens by 2 to 3 %."""
 _MAX_NAMED = 4
+_MOST = 0.8
+"""Of the images of a folder: if so many are of one size, the others are no part of it (screenshots, thumbnails)."""
 _SAMPLED_IMAGES, _SAMPLED_STEP = 24, 3
 _SPAN_PERCENTILES = 0.5, 99.5
 _LARGEST_16_BIT = 65535
+Size = tuple[int, int]
 _Key = Callable[[ExifLens], float | None]
 
 WRITTEN_SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -59,10 +65,14 @@ class ImageSource:
         if not s.image_paths:
             self.height, self.width = s.rgb(0).shape[:2]
             return
-        self.headers = read_headers(s.root, dict(zip(s.names, s.image_paths, strict=True)))
+        self.headers = self._of_one_size(read_headers(s.root, dict(zip(s.names, s.image_paths, strict=True))))
         self._common = self._orientation()
         self._require_one_camera()
         self.width, self.height = self._size(next(iter(self.headers.of.values())))
+
+    def _of_one_size(self, headers: Headers) -> Headers:
+        """The headers without those of images that are to be left out for their size."""
+        return headers
 
     def _orientation(self) -> int | None:
         """The EXIF orientation by which all images are turned; None where each is turned by its own."""
@@ -88,7 +98,7 @@ class ImageSource:
             for note in self.sequence.notes:
                 warn(f"{self.sequence.format}: {note}")
         for index in range(len(self.sequence)):
-            if wanted is not None and index not in wanted:
+            if (wanted is not None and index not in wanted) or self.sequence.names[index] in self.headers.odd:
                 continue
             try:
                 rgb = self._rgb(index)
@@ -185,10 +195,20 @@ def written_names(names: Iterable[str], root: Path) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Headers:
-    """Headers of the images that can be read, by name, and why the others cannot."""
+    """Headers of the images that can be read, by name, and why the others cannot; the sizes (width, height) of those
+    that are left out, as most are of another."""
 
     of: Mapping[str, Header]
     unreadable: Mapping[str, str]
+    odd: Mapping[str, Size] = field(default_factory=dict)
+
+    def of_most(self, size: Callable[[Header], Size]) -> Headers:
+        """Leave out the images of another size than `_MOST` of them have; none where fewer agree."""
+        common, count = Counter(size(header) for header in self.of.values()).most_common(1)[0]
+        if count < _MOST * len(self.of):
+            return self
+        odd = {name: header.size for name, header in self.of.items() if size(header) != common}
+        return replace(self, of={n: h for n, h in self.of.items() if n not in odd}, odd={**self.odd, **odd})
 
     def focal_px(self, width: int, height: int) -> float | None:
         """Median focal length, in pixels of an image of width x height, of the images that state one in EXIF."""
@@ -216,7 +236,19 @@ class Headers:
         return (QUARTER_TURNS[common] - QUARTER_TURNS[self.of[name].orientation]) % 4
 
     def warn(self, warn: Callable[[str], None]) -> None:
-        """Report images of several makes or models, which are treated as one camera, and files of several images."""
+        """Report images of several makes or models, which are treated as one camera, files of several images, unusable
+        colour profiles, and images left out for their size."""
+        if self.odd:
+            width, height = next(iter(self.of.values())).size
+            warn(
+                f"{len(self.odd)} of {len(self.odd) + len(self.of)} images are left out, as their size is not "
+                f"{width}x{height}: {_first(f'{n} ({w}x{h})' for n, (w, h) in self.odd.items())}"
+            )
+        if unusable := [name for name, h in self.of.items() if h.colours == UNUSABLE]:
+            warn(
+                f"the colour profile of {len(unusable)} images is damaged, or of another kind of colours; they are "
+                f"taken for sRGB: {_first(unusable)}"
+            )
         several = [f"{name} ({h.images})" for name, h in self.of.items() if h.images > 1]
         if several:
             warn(
@@ -235,6 +267,11 @@ class Headers:
                 f"by their EXIF the images were taken with {len(cameras)} cameras ({told}), which are treated as one: "
                 "if their lenses differ, keep the images of one camera together"
             )
+
+
+def _first(names: Iterable[str]) -> str:
+    some = list(itertools.islice(names, _MAX_NAMED + 1))
+    return ", ".join(some[:_MAX_NAMED]) + (", …" if len(some) > _MAX_NAMED else "")
 
 
 def read_headers(folder: Path, images: Mapping[str, Path]) -> Headers:

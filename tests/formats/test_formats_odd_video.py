@@ -9,7 +9,8 @@ import pytest
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.video import VideoReader, pixel_aspect, probe_video
-from msgs_slam.formats.video_streams import AvCapture, read_moov, video_sphere
+from msgs_slam.formats.video_head import read_moov, video_sphere
+from msgs_slam.formats.video_streams import AvCapture
 from msgs_slam.pipelines.source.opening import VideoSource
 from tests.formats.test_formats_video import encode, hdr_signal, textured, with_matrix, woven, write_hdr
 

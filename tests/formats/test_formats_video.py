@@ -16,7 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.video import VideoReader, _Clock, probe_video
+from msgs_slam.formats.video import VideoReader, probe_video
+from msgs_slam.formats.video_clock import Clock
 from msgs_slam.formats.video_writer import H264, MPEG4, VP9, best_codec, write_browser_video, write_video
 
 REPO = Path(__file__).resolve().parents[2]
@@ -242,7 +243,7 @@ def test_a_damaged_file_is_silent_on_stderr(tmp_path: Path) -> None:
 
 
 def _run_clock(stored: list[float], fps: float = 10.0) -> tuple[list[float], int]:
-    clock = _Clock(fps)
+    clock = Clock(fps)
     for s in stored:
         clock.next(s)
     return clock.times, clock.repairs

@@ -13,7 +13,7 @@ from PIL import Image
 from msgs_slam.formats.datasets.sequence import Camera
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.video_streams import PART, WHOLE, image_sphere, video_sphere
+from msgs_slam.formats.video_head import PART, WHOLE, image_sphere, video_sphere
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.frames.inputs import check_frames
 from msgs_slam.pipelines.geometry.camera import CUBE, ONE_CAMERA, Rig, rig_of
