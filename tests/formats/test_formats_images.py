@@ -9,14 +9,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageCms
 from PIL.TiffImagePlugin import IFDRational
 from pillow_heif import from_bytes
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.exif import ExifLens, lens_of, place_of
-from msgs_slam.formats.image_folder import frame_number, list_images, natural_key, read_image_times
+from msgs_slam.formats.image_folder import frame_number, list_images, natural_key, read_image_times, unread_images
 from msgs_slam.formats.images import (
+    OTHER,
+    UNUSABLE,
     decode_rgb,
     exif_gps,
     exif_time,
@@ -31,6 +33,7 @@ from msgs_slam.formats.images import (
     write_grey_png,
     write_rgb,
 )
+from msgs_slam.pipelines.source.opening import open_source
 
 
 def _focal_px(path: Path, width: int, height: int) -> float | None:
@@ -245,7 +248,8 @@ def _png_claiming(width: int, height: int) -> bytes:
 @pytest.mark.parametrize("side", [11_000, 12_000, 60_000])
 def test_bombs_are_refused_by_their_header(tmp_path: Path, side: int) -> None:
     (tmp_path / "bomb.png").write_bytes(_png_claiming(side, side))
-    with pytest.raises(InputError, match=r"scale it down|exceeds limit|truncated"):
+    limit = r"bomb\.png.* is over the limit of 120 million pixels: scale it down"
+    with pytest.raises(InputError, match=limit):
         read_rgb(tmp_path / "bomb.png")
 
 
@@ -396,3 +400,133 @@ def test_frame_numbers() -> None:
     assert frame_number(Path("x1/frame-000012.color.jpg")) == 12
     assert frame_number(Path("rgb_7.png")) == 7
     assert frame_number(Path("cover.png")) is None
+
+
+SRGB_IN_XYZ = np.array([[0.43607, 0.38515, 0.14307], [0.22249, 0.71687, 0.06061], [0.01392, 0.09708, 0.71410]])
+P3_IN_XYZ = np.array([[0.51512, 0.29198, 0.15710], [0.24120, 0.69225, 0.06657], [-0.00105, 0.04189, 0.78407]])
+"""Columns are red, green and blue, by the white of ICC profiles (D50)."""
+
+
+def icc_profile(in_xyz: np.ndarray, gamma: float) -> bytes:
+    """An RGB profile of version 2 by its primaries (3, 3) and exponent."""
+
+    def xyz(values: np.ndarray) -> bytes:
+        return b"XYZ " + bytes(4) + struct.pack(">3i", *(round(65536 * v) for v in values))
+
+    curve = b"curv" + bytes(4) + struct.pack(">IH2x", 1, round(256 * gamma))
+    about = b"desc" + bytes(4) + struct.pack(">I", 5) + b"made\0" + bytes(79)
+    tags = {b"desc": about, b"cprt": b"text" + bytes(4) + b"none", b"wtpt": xyz(np.array([0.9642, 1.0, 0.8249]))}
+    for i, name in enumerate(b"rgb"):
+        tags[bytes([name]) + b"XYZ"], tags[bytes([name]) + b"TRC"] = xyz(in_xyz[:, i]), curve
+    table, body, at = struct.pack(">I", len(tags)), b"", 132 + 12 * len(tags)
+    for name, data in tags.items():
+        table += name + struct.pack(">II", at + len(body), len(data))
+        body += data + bytes(-len(data) % 4)
+    head = struct.pack(">I4xI4s4s4s12x4s", at + len(body), 0x02200000, b"mntr", b"RGB ", b"XYZ ", b"acsp")
+    white = struct.pack(">3i", 63190, 65536, 54061)
+    return (head.ljust(68, b"\0") + white).ljust(128, b"\0") + table + body
+
+
+def in_srgb(numbers: np.ndarray, in_xyz: np.ndarray, gamma: float) -> np.ndarray:
+    """What numbers (..., 3) of such a profile are in sRGB, 0 to 255."""
+    light = ((numbers / 255.0) ** gamma @ (np.linalg.inv(SRGB_IN_XYZ) @ in_xyz).T).clip(0, 1)
+    return 255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+@pytest.fixture
+def patches() -> np.ndarray:
+    """(64, 96, 3) of flat colours."""
+    return np.kron(np.random.default_rng(3).integers(30, 225, (4, 6, 3)), np.ones((16, 16, 1))).astype(np.uint8)
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.png", "palette.png", "alpha.png", "a.tif", "a.webp", "a.avif", "a.heic"])
+def test_colours_of_a_profile_become_srgb(tmp_path: Path, patches: np.ndarray, name: str) -> None:
+    image = Image.fromarray(patches)
+    if name == "palette.png":
+        image = image.quantize(24)
+    if name == "alpha.png":
+        image.putalpha(Image.new("L", image.size, 200))
+    image.save(
+        tmp_path / name, icc_profile=icc_profile(P3_IN_XYZ, 2.2), quality=100 if name[-3:] in ("jpg", "ebp") else 95
+    )
+    wanted, found = in_srgb(patches, P3_IN_XYZ, 2.2)[8::16, 8::16], read_rgb(tmp_path / name)[8::16, 8::16]
+    assert np.abs(wanted - patches[8::16, 8::16]).mean() > 8
+    assert 0 < np.abs(wanted - found).mean() < (2.5 if name[-4:] in ("webp", "avif", "heic") else 1.2)
+    assert read_header(tmp_path / name).colours == OTHER
+    assert not is_plain(tmp_path / name)
+
+
+def test_primaries_that_heif_states_become_srgb(tmp_path: Path, patches: np.ndarray) -> None:
+    stated = {"color_primaries": 12, "transfer_characteristics": 13, "matrix_coefficients": 6, "full_range_flag": 1}
+    Image.fromarray(patches).save(tmp_path / "a.heic", quality=95, **stated)
+    srgb_light = np.where(patches <= 10.3, patches / 3294.6, ((patches / 255 + 0.055) / 1.055) ** 2.4)
+    wanted = in_srgb(255 * srgb_light, P3_IN_XYZ, 1.0)[8::16, 8::16]
+    assert 0 < np.abs(wanted - read_rgb(tmp_path / "a.heic")[8::16, 8::16]).mean() < 2.5
+
+
+def test_grey_of_another_gamma_becomes_srgb(tmp_path: Path) -> None:
+    """An RGB profile beside grey pixels, as raw converters write it."""
+    ramp = np.repeat(np.arange(16, 240, 8, dtype=np.uint8)[None], 4, axis=0)
+    Image.fromarray(ramp).save(tmp_path / "a.png", icc_profile=icc_profile(SRGB_IN_XYZ, 1.8))
+    wanted = in_srgb(np.repeat(ramp[..., None], 3, axis=2), SRGB_IN_XYZ, 1.8)
+    assert np.abs(wanted - read_rgb(tmp_path / "a.png")).max() < 2.5
+
+
+@pytest.mark.parametrize("spelling", ["lcms", "by hand"])
+def test_srgb_stays_as_it_is_byte_for_byte(tmp_path: Path, patches: np.ndarray, spelling: str) -> None:
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    if spelling == "by hand":
+        profile = profile.replace(b"sRGB", b"mine")
+    Image.fromarray(patches).save(tmp_path / "a.png", icc_profile=profile)
+    assert (read_rgb(tmp_path / "a.png") == patches).all()
+    assert is_plain(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("damage", ["cut", "noise", "lab"])
+def test_an_unusable_profile_changes_nothing_and_is_named(tmp_path: Path, patches: np.ndarray, damage: str) -> None:
+    whole = icc_profile(P3_IN_XYZ, 2.2)
+    profile = {
+        "cut": whole[:200],
+        "noise": np.random.default_rng(0).bytes(500),
+        "lab": ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes(),
+    }[damage]
+    for i in range(3):
+        Image.fromarray(patches).save(tmp_path / f"{i}.png", **({"icc_profile": profile} if i else {}))
+    assert (read_rgb(tmp_path / "1.png") == patches).all()
+    assert read_header(tmp_path / "1.png").colours == UNUSABLE
+    assert not is_plain(tmp_path / "1.png")
+    said: list[str] = []
+    assert len(list(open_source(tmp_path).read(warn=said.append))) == 3
+    (only,) = said
+    assert "colour profile of 2 images is damaged" in only
+    assert only.endswith("taken for sRGB: 1.png, 2.png")
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_avif_is_upright(tmp_path: Path, picture: np.ndarray, orientation: int) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    for name in ("a.jpg", "b.avif"):
+        Image.fromarray(picture).save(tmp_path / name, quality=95, exif=exif)
+    assert list_images(tmp_path) == [tmp_path / "a.jpg", tmp_path / "b.avif"]
+    jpeg, avif = read_rgb(tmp_path / "a.jpg"), read_rgb(tmp_path / "b.avif")
+    assert image_size(tmp_path / "b.avif") == (avif.shape[1], avif.shape[0])
+    assert jpeg.shape == avif.shape
+    assert 0 < np.abs(avif.astype(int) - jpeg).mean() < 4
+
+
+def test_images_that_are_not_read_are_listed(tmp_path: Path) -> None:
+    """But for the raw file of a photograph that lies there as JPEG, too."""
+    for name in ["a.jpg", "b.JPG", "a.CR3", "d10.jxl", "d9.raf", "e.Orf", "notes.txt", "b.dng", ".f.rw2"]:
+        (tmp_path / name).touch()
+    assert [p.name for p in unread_images(tmp_path)] == ["d9.raf", "d10.jxl", "e.Orf"]
+
+
+def test_images_that_are_not_read_are_named(tmp_path: Path, picture: np.ndarray) -> None:
+    for i in range(3):
+        write_rgb(tmp_path / f"{i}.jpg", picture)
+        (tmp_path / f"more{i}.jxl").write_bytes(b"\xff\x0a")
+    said: list[str] = []
+    assert len(list(open_source(tmp_path).read(warn=said.append))) == 3
+    assert len(said) == 1
+    assert "3 files of a format that is not read (.jxl) are left out, more0.jxl first" in said[0]

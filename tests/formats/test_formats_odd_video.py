@@ -1,15 +1,17 @@
 """Videos whose frames are not simply shown as stored: interlaced, stretched, mirrored, raw, blank, damaged."""
 
 import sys
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.video import VideoReader, pixel_aspect, probe_video
-from msgs_slam.formats.video_head import read_moov, video_sphere
+from msgs_slam.formats.video_head import Track, main_track, read_moov, read_tracks, video_sphere
 from msgs_slam.formats.video_streams import AvCapture
 from msgs_slam.pipelines.source.opening import VideoSource
 from tests.formats.test_formats_video import encode, hdr_signal, textured, with_matrix, woven, write_hdr
@@ -242,3 +244,162 @@ def test_what_pyav_cannot_open_has_no_frame(tmp_path: Path) -> None:
     capture = AvCapture(tmp_path / "a.mp4", "HLG")
     assert (capture.isOpened(), capture.grab()) == (False, False)
     capture.release()
+
+
+def stored_over(path: Path, out: Path, first: int = 0, last: int | None = None, container: str | None = None) -> Path:
+    """Copy packets of the first video stream without decoding; those before `first` are to be decoded but not shown."""
+    with av.open(str(path)) as source, av.open(str(out), "w", format=container) as target:
+        stream = source.streams.video[0]
+        copied = target.add_stream_from_template(stream)
+        for packet in list(source.demux(stream))[:last]:
+            if packet.dts is None:
+                continue
+            packet.pts, packet.dts, packet.stream = packet.pts - first * stream.time_base.denominator // 25, (
+                packet.dts - first * stream.time_base.denominator // 25), copied  # fmt: skip
+            target.mux(packet)
+    return out
+
+
+def test_what_an_edit_list_hides_is_not_missing(tmp_path: Path) -> None:
+    options = {"g": "50", "bf": "2"}
+    whole = encode(tmp_path / "whole.mp4", textured(50, 96, 64), options=options)
+    trimmed = stored_over(whole, tmp_path / "trimmed.mp4", first=20)
+    (track,) = read_tracks(trimmed)
+    assert track.samples == 50
+    assert track.shown == pytest.approx(30 / 50, abs=0.05)
+    said: list[str] = []
+    source = VideoSource(trimmed)
+    assert abs(len(list(source.read(warn=said.append))) - 30) <= 2
+    assert abs(source.expected_frames - 30) <= 2
+    assert said == []
+
+
+def test_a_trimmed_file_that_is_cut_off_is_truncated(tmp_path: Path) -> None:
+    whole = encode(tmp_path / "whole.mp4", textured(50, 96, 64), options={"g": "50", "bf": "0"})
+    trimmed = stored_over(whole, tmp_path / "trimmed.mp4", first=20)
+    data = bytearray(trimmed.read_bytes())
+    start, end = data.index(b"mdat"), data.index(b"moov")
+    data[start + (end - start) * 7 // 10 : end - 4] = bytes(end - 4 - start - (end - start) * 7 // 10)
+    trimmed.write_bytes(data)
+    said: list[str] = []
+    assert 0 < len(list(VideoSource(trimmed).read(warn=said.append))) < 27
+    assert any("is truncated: its header declares" in s for s in said), said
+
+
+@pytest.mark.parametrize("shift", [1000.0, -9.0, 90_000.0])
+def test_joined_recordings_go_on_with_the_usual_step(tmp_path: Path, shift: float) -> None:
+    """Transport streams, one behind the other, each by a clock of its own."""
+    parts = []
+    for name, start in (("a.ts", 10.0), ("b.ts", 10.0 + shift)):
+        frames = textured(20, 96, 64)
+        with av.open(str(tmp_path / name), "w") as file:
+            stream = file.add_stream("libx264", rate=25, options={"bf": "0"})
+            stream.height, stream.width, stream.pix_fmt = 64, 96, "yuv420p"
+            for time, rgb in enumerate(frames):
+                frame = av.VideoFrame.from_ndarray(rgb, format="rgb24").reformat(format="yuv420p")
+                frame.pts, frame.time_base = time + round(25 * start), Fraction(1, 25)
+                file.mux(stream.encode(frame))
+            file.mux(stream.encode())
+        parts.append((tmp_path / name).read_bytes())
+    (tmp_path / "both.ts").write_bytes(b"".join(parts))
+    said: list[str] = []
+    source = VideoSource(tmp_path / "both.ts")
+    times = [f.timestamp for f in source.read(warn=said.append)]
+    assert len(times) == 40
+    np.testing.assert_allclose(times, np.arange(40) / 25, atol=1e-3)
+    assert source.expected_frames < 20_000
+    assert [s for s in said if "clock jumps or starts anew 1 times" in s] == said
+
+
+@pytest.mark.parametrize("pyav", [True, False])
+def test_hdr_is_known_by_every_container(tmp_path: Path, pyav: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Matroska's own elements; an MP4 without its box, and a transport stream, by what HEVC says: with PyAV."""
+    write_hdr(tmp_path / "a.mp4", [hdr_signal(f / 255, "HLG") for f in textured(3, 96, 64)], "HLG")
+    stored_over(tmp_path / "a.mp4", tmp_path / "a.mkv")
+    stored_over(tmp_path / "a.mp4", tmp_path / "a.ts")
+    (tmp_path / "b.mp4").write_bytes((tmp_path / "a.mp4").read_bytes().replace(b"colrncl", b"freencl"))
+    if not pyav:
+        monkeypatch.setitem(sys.modules, "av", None)
+    found = {name: VideoReader(tmp_path / name) for name in ("a.mp4", "a.mkv", "b.mp4", "a.ts")}
+    by_stream = "HLG" if pyav else ""
+    assert [r.hdr for r in found.values()] == ["HLG", "HLG", by_stream, by_stream]
+    if pyav:
+        first = [next(r).rgb.astype(float) for r in found.values()]
+        assert all(np.abs(f - first[0]).mean() < 1 for f in first)
+
+
+def two_tracks(path: Path, sizes: list[tuple[int, int]], default: int) -> Path:
+    """Video tracks of these sizes, of which one is marked to be shown."""
+    with av.open(str(path), "w") as file:
+        streams = []
+        for number, (width, height) in enumerate(sizes):
+            stream = file.add_stream("libx264", rate=25)
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            stream.disposition = av.stream.Disposition.default if number == default else av.stream.Disposition(0)
+            streams.append(stream)
+        for stream in streams:
+            for time, rgb in enumerate(textured(8, stream.width, stream.height)):
+                frame = av.VideoFrame.from_ndarray(rgb, format="rgb24").reformat(format="yuv420p")
+                frame.pts, frame.time_base = time, Fraction(1, 25)
+                file.mux(stream.encode(frame))
+            file.mux(stream.encode())
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
+def test_the_main_track_is_read_and_the_other_named(
+    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = two_tracks(tmp_path / f"a{suffix}", [(64, 48), (96, 64)], default=1)
+    said: list[str] = []
+    source = VideoSource(path)
+    assert {f.rgb.shape for f in source.read(warn=said.append)} == {(64, 96, 3)}
+    assert len(said) == 1
+    assert "holds 2 video tracks: track 2 (96x64) is used, not track 1 (64x48)" in said[0]
+    monkeypatch.setitem(sys.modules, "av", None)
+    said.clear()
+    source = VideoSource(path)
+    assert {f.rgb.shape for f in source.read(warn=said.append)} == {(48, 64, 3)}
+    assert "track 1 (64x48) is used, not track 2 (96x64)" in said[0]
+    assert "-map 0:v:1" in said[0]
+
+
+def test_the_main_track_is_the_marked_one_else_the_largest() -> None:
+    small, large, cover = Track(64, 48), Track(96, 64), Track(4000, 3000, samples=1)
+    assert main_track([]) == main_track([small]) == main_track([large, large]) == 0
+    assert main_track([small, large, cover]) == 1
+    assert main_track([replace(large, is_default=False), small]) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "form"), [("a.mov", "prores_ks", "yuva444p10le"), ("a.webm", "libvpx-vp9", "yuva420p")]
+)
+def test_an_alpha_channel_is_named(tmp_path: Path, name: str, codec: str, form: str) -> None:
+    with av.open(str(tmp_path / name), "w") as file:
+        stream = file.add_stream(codec, rate=25)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, form
+        if codec == "libvpx-vp9":
+            stream.metadata["alpha_mode"] = "1"
+        for time, rgb in enumerate(textured(3, 96, 64)):
+            rgba = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
+            frame = av.VideoFrame.from_ndarray(rgba, format="rgba").reformat(format=form)
+            frame.pts, frame.time_base = time, Fraction(1, 25)
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode())
+    said: list[str] = []
+    assert len(list(VideoSource(tmp_path / name).read(warn=said.append))) == 3
+    assert [s for s in said if "has an alpha channel, which is not read" in s and "--masks MASKS" in s] == said
+    assert said
+
+
+@pytest.mark.parametrize("keep", [40, 200, 400, 700])
+def test_damaged_heads_say_nothing(tmp_path: Path, keep: int) -> None:
+    """Neither a head that is cut off nor one of noise raises anything."""
+    frames = textured(3, 96, 64)
+    noise = np.random.default_rng(keep).integers(0, 256, 4000, dtype=np.uint8).tobytes()
+    for suffix in (".mp4", ".mkv"):
+        path = encode(tmp_path / f"a{suffix}", frames)
+        data = path.read_bytes()
+        start = data.index(b"moov") + 4 if suffix == ".mp4" else 30
+        path.write_bytes(data[: start + keep] + noise)
+        assert all(0 <= track.shown <= 1 for track in read_tracks(path))

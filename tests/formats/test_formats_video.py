@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.video import VideoReader, probe_video
-from msgs_slam.formats.video_clock import Clock
+from msgs_slam.formats.video_clock import Clock, longest_step
 from msgs_slam.formats.video_writer import H264, MPEG4, VP9, best_codec, write_browser_video, write_video
 
 REPO = Path(__file__).resolve().parents[2]
@@ -262,6 +262,30 @@ def test_one_wrong_time_does_not_shift_the_rest() -> None:
 def test_a_clock_set_back_keeps_its_steps() -> None:
     times, _ = _run_clock([0.0, 0.1, 0.2, 0.0, 0.05, 0.15])
     assert times == pytest.approx([0, 0.1, 0.2, 0.3, 0.35, 0.45])
+
+
+def test_a_clock_set_back_is_one_restart_and_no_repair() -> None:
+    clock = Clock(10.0)
+    for stored in [0.0, 0.1, 0.2, 0.0, 0.1, 0.2, 0.3]:
+        clock.next(stored)
+    assert clock.times == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    assert (clock.repairs, clock.restarts) == (0, 1)
+
+
+@pytest.mark.parametrize(("head", "kept"), [(b"G" + bytes(187) + b"G", 8.0), (b"", 60.0)])
+def test_a_clock_that_jumps_goes_on_and_one_that_pauses_is_kept(head: bytes, kept: float) -> None:
+    far = 50 * longest_step(head)
+    clock = Clock(25.0, longest_step(head))
+    for stored in [0.0, 0.04, 0.08, 0.08 + kept, 0.12 + kept, far, far + 0.04, 0.2 + kept, 0.24 + kept]:
+        clock.next(stored)
+    steps = np.diff(clock.times)
+    assert steps == pytest.approx([0.04, 0.04, kept, 0.04, 0.04, 0.04, 0.04, 0.04], abs=1e-9)
+    assert (clock.repairs, clock.restarts) == (0, 2)
+
+
+def test_slow_clocks_do_not_jump() -> None:
+    hours = [3 * 3600.0 * i for i in range(6)]
+    assert _run_clock(hours, 1 / (3 * 3600))[0] == hours
 
 
 def test_missing_times_fall_back_to_the_rate() -> None:

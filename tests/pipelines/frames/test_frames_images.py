@@ -13,6 +13,7 @@ from msgs_slam.pipelines.frames.masks import FrameMasks, open_masks
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.types import Frame
+from tests.formats.test_formats_images import P3_IN_XYZ, icc_profile
 
 EQUIVALENT, FOCAL, ZOOM, PITCH = 0xA405, 0x920A, 0xA404, 0xA20E
 
@@ -172,3 +173,40 @@ def test_focal_lengths_that_agree_are_one_camera(
     source = open_source(_photos(tmp_path / "photos", *lenses))
     wanted = None if equivalent is None else pytest.approx(equivalent / 43.2666 * 80, rel=1e-4)
     assert source.exif_focal() == wanted
+
+
+def _sized(folder: Path, *sizes: tuple[int, int]) -> Path:
+    """Images of these heights and widths."""
+    folder.mkdir()
+    for i, size in enumerate(sizes):
+        Image.fromarray(_noise(i, size)).save(folder / f"{i}.png")
+    return folder
+
+
+def test_a_few_images_of_another_size_are_left_out_and_named(tmp_path: Path) -> None:
+    """Also where it is the first one, and beside photos of a phone that was turned."""
+    source, said = open_source(_sized(tmp_path / "a", (64, 48), *[(48, 64)] * 9, (30, 40))), []
+    assert (source.width, source.height) == (64, 48)
+    assert [f.source_index for f in source.read(warn=said.append)] == list(range(1, 10))
+    assert said == ["2 of 11 images are left out, as their size is not 64x48: 10.png (40x30), 0.png (48x64)"]
+    _turned(tmp_path / "b", 6, 1, 6, 8, 6)
+    Image.fromarray(_noise(0, (20, 20))).save(tmp_path / "b" / "9.png")
+    said.clear()
+    source = open_source(tmp_path / "b")
+    assert [f.source_index for f in source.read(warn=said.append)] == list(range(5))
+    assert any("1 of 6 images are left out" in s for s in said)
+    assert any("some sideways" in s for s in said)
+
+
+def test_sizes_without_a_clear_majority_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"differ in size: 0\.png is 64x48, 3\.png is 48x64 \(1 of 4 differ"):
+        open_source(_sized(tmp_path / "a", *[(48, 64)] * 3, (64, 48)))
+
+
+def test_images_with_a_profile_are_written_anew(tmp_path: Path) -> None:
+    """A copy would be shown in other colours than those of the map."""
+    profile = icc_profile(P3_IN_XYZ, 2.2)
+    for i in range(3):
+        Image.fromarray(_noise(i)).save(tmp_path / f"{i}.png", **({"icc_profile": profile} if i == 1 else {}))
+    source = open_source(tmp_path)
+    assert [source.original(i) is not None for i in range(3)] == [True, False, True]

@@ -1,12 +1,21 @@
 """Picking by windows and sharpness."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from msgs_slam.formats.images import read_rgb
 from msgs_slam.formats.video import VideoFrame
+from msgs_slam.formats.video_writer import write_video
+from msgs_slam.pipelines.engine.stages import StageContext
+from msgs_slam.pipelines.frames.keyframes import pick_frames
+from msgs_slam.pipelines.source.opening import open_source
+from msgs_slam.pipelines.source.overlap import Motion
 from msgs_slam.pipelines.source.sharpness import reduce_image, reduced_size, sharpest_of_windows, sharpness
 
 BLANK = np.zeros((2, 2, 3), np.uint8)
@@ -82,3 +91,67 @@ def test_an_image_that_is_small_enough_is_not_touched() -> None:
     image = np.zeros((10, 20, 3), np.uint8)
     assert reduce_image(image, 20) is image
     assert reduce_image(image, 10).shape == (5, 10, 3)
+
+
+def _filmed(moves: list[float], fps: float = 30.0, seed: int = 0) -> list[VideoFrame]:
+    """Images 240 wide of a textured wall; each is moved by so many pixels from the one before it."""
+    rng = np.random.default_rng(seed)
+    width = 240 + int(sum(moves)) + 2
+    wall = cv2.resize(
+        rng.integers(0, 255, (45, width // 4, 3), dtype=np.uint8), (width, 180), interpolation=cv2.INTER_CUBIC
+    )
+    places = np.concatenate([[0], np.cumsum(moves)]).astype(int)
+    return [VideoFrame(i, i / fps, wall[:, x : x + 240]) for i, x in enumerate(places)]
+
+
+def _wanted(pictures: list[VideoFrame], rate: float = 10.0) -> tuple[list[int], list[int]]:
+    motion, chosen = Motion(), []
+    for picture, _ in sharpest_of_windows(motion.watch(pictures), rate, measure=lambda rgb: 0.0):
+        chosen.append(picture.source_index)
+        motion.pick(picture.source_index)
+    return chosen, motion.wanted()
+
+
+def test_all_images_are_wanted_where_the_picked_ones_hardly_overlap() -> None:
+    chosen, wanted = _wanted(_filmed([20.0] * 29))
+    assert chosen == list(range(0, 30, 3))
+    assert wanted == list(range(30))
+
+
+@pytest.mark.parametrize("moves", [[2.0] * 29, [0.0] * 29, [1.0] * 12 + [20.0] * 3 + [1.0] * 14])
+def test_a_walk_a_still_camera_and_one_quick_turn_keep_their_picks(moves: list[float]) -> None:
+    chosen, wanted = _wanted(_filmed(moves))
+    assert wanted == chosen
+
+
+def test_only_the_fast_part_of_a_film_is_kept_whole() -> None:
+    _, wanted = _wanted(_filmed([1.0] * 44 + [20.0] * 30 + [1.0] * 44))
+    assert set(range(45, 73)) <= set(wanted)
+    assert set(wanted) >= set(range(0, 119, 3))
+    assert not set(wanted) & {1, 2, 4, 5, 28, 29, 100, 101, 115, 116}
+
+
+def test_a_cut_and_a_blank_wall_are_no_motion() -> None:
+    two = _filmed([1.0] * 14) + [
+        p._replace(source_index=15 + i, timestamp=(15 + i) / 30) for i, p in enumerate(_filmed([1.0] * 14, seed=1))
+    ]
+    chosen, wanted = _wanted(two)
+    assert wanted == chosen
+    blank = [VideoFrame(i, i / 30, np.full((180, 240, 3), 90, np.uint8)) for i in range(30)]
+    chosen, wanted = _wanted(blank)
+    assert wanted == chosen
+
+
+def test_a_time_lapse_is_kept_whole(tmp_path: Path, make_context: Callable[..., StageContext]) -> None:
+    """As frames counted on, each in a file of its number."""
+    path = tmp_path / "lapse.avi"
+    write_video(path, [p.rgb for p in _filmed([20.0] * 23)], 30.0)
+    context = make_context(path)
+    frames = pick_frames(context, open_source(path), None)
+    assert [f.source_index for f in frames] == [f.id for f in frames] == list(range(24))
+    assert [f.timestamp for f in frames] == pytest.approx(np.arange(24) / 30, abs=1e-3)
+    stored = sorted(p.name for p in (context.snapshot / "picked").iterdir())
+    assert stored == [f.name for f in frames] == [f"{i:06d}.jpg" for i in range(24)]
+    own = [read_rgb(context.snapshot / "picked" / name).astype(float) for name in stored]
+    assert all(np.abs(a - p.rgb).mean() < 6 for a, p in zip(own, _filmed([20.0] * 23), strict=True))
+    assert pick_frames(context, open_source(path), None) == frames
