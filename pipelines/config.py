@@ -114,7 +114,7 @@ class FramesConfig:
 
     rate: float = setting(
         10.0,
-        "frames per second to keep of a video; the sharpest of each window. 0 = all",
+        "frames per second to keep of a video; the sharpest of each window, more where they hardly overlap. 0 = all",
         within=(0.1, 1000),
         or_zero=True,
     )

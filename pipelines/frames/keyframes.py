@@ -104,7 +104,7 @@ class _Tracker:
 
 
 def pick_frames(context: StageContext, source: Source, faces: Faces | None) -> list[Frame]:
-    """The sharpest image of every window of time, and all images where these hardly overlap, kept in the snapshot.
+    """The sharpest image of every window of time, and more images where these hardly overlap, kept in the snapshot.
 
     Raises InputError for a source of one.
     """

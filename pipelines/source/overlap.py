@@ -46,34 +46,43 @@ class Motion:
         self._picks.append(number)
 
     def wanted(self) -> list[int]:
-        """Return the picked numbers, and all that were seen between two of them where the steps are too large; before
-        the first and behind the last as at the step beside it."""
-        far = _too_large(self._steps)
-        if not any(far):
+        """Return the picked numbers; and where the steps between them are too large so many of those seen between that
+        the steps become small, before the first and behind the last as at the step beside it."""
+        first = np.searchsorted(self._seen, self._picks)
+        strides = _strides(self._steps, np.diff(first).tolist())
+        if not any(strides):
             return self._picks
-        step_of = np.searchsorted(self._picks, self._seen, side="right").clip(1, len(far)) - 1
         kept = set(self._picks)
-        return [number for number, step in zip(self._seen, step_of, strict=True) if number in kept or far[step]]
+        before = (np.searchsorted(self._picks, self._seen, side="right") - 1).clip(0)
+        stride = np.array(strides)[before.clip(0, len(strides) - 1)]
+        behind = np.arange(len(self._seen)) - first[before]
+        more = (stride > 0) & (behind % np.maximum(stride, 1) == 0)
+        return [number for number, is_more in zip(self._seen, more, strict=True) if is_more or number in kept]
 
 
 def _moved(images: list[NDArray[np.uint8]]) -> float:
-    """Median motion (fraction of the longer side) from the first to the last of images in a row; infinite where the
-    corners are lost, 0 where there are none."""
-    start = now = corners(images[0], np.zeros((0, 2)), _CORNERS, _APART_PX)
-    if len(start) < _FEWEST:
-        return 0.0
+    """Way of things through images in a row (fraction of the longer side), as the sum of the medians over corners; 0
+    where there are none, infinite where they are lost from one image to the next."""
+    way, points = 0.0, np.zeros((0, 2))
     for before, after in itertools.pairwise(images):
-        moved, found = follow(before, after, now, now)
-        start, now = start[found], moved[found]
-    if len(start) < _FEWEST:
-        return np.inf
-    return float(np.median(np.linalg.norm(now - start, axis=1))) / max(images[0].shape)
+        if len(points) < _FEWEST:
+            points = corners(before, np.zeros((0, 2)), _CORNERS, _APART_PX)
+        if len(points) < _FEWEST:
+            continue
+        moved, found = follow(before, after, points, points)
+        if found.sum() < _FEWEST:
+            return np.inf
+        way += float(np.median(np.linalg.norm(moved[found] - points[found], axis=1))) / max(after.shape)
+        points = moved[found]
+    return way
 
 
-def _too_large(steps: Sequence[float]) -> list[bool]:
+def _strides(steps: Sequence[float], images: Sequence[int]) -> list[int]:
+    """Numbers of images after which one more is kept, for each step of so many images; 0 where it is not too large."""
     usual = [float(np.median(steps[max(0, k - _AROUND) : k + _AROUND + 1])) for k in range(len(steps))]
-    far: list[bool] = []
-    for is_far, run in itertools.groupby(usual, lambda step: step > _FAR):
+    strides: list[int] = []
+    for is_far, run in itertools.groupby(zip(usual, images, strict=True), lambda step: step[0] > _FAR):
         together = list(run)
-        far += [is_far and max(together) > _TOO_FAR] * len(together)
-    return far
+        too_far = is_far and max(way for way, _ in together) > _TOO_FAR
+        strides += [max(1, int(_FAR * count / way)) if too_far else 0 for way, count in together]
+    return strides

@@ -124,6 +124,15 @@ def test_a_walk_a_still_camera_and_one_quick_turn_keep_their_picks(moves: list[f
     assert wanted == chosen
 
 
+def test_a_low_rate_gets_so_many_more_that_images_overlap() -> None:
+    """Not all: at two pixels of 240 an image it takes seven of them to a sixteenth."""
+    chosen, wanted = _wanted(_filmed([2.0] * 119), rate=1.0)
+    assert chosen == [0, 30, 60, 90]
+    assert wanted == [second + n for second in chosen for n in range(0, 30, 7)]
+    chosen, wanted = _wanted(_filmed([2.0] * 119), rate=3.0)
+    assert wanted == chosen == list(range(0, 120, 10))
+
+
 def test_only_the_fast_part_of_a_film_is_kept_whole() -> None:
     _, wanted = _wanted(_filmed([1.0] * 44 + [20.0] * 30 + [1.0] * 44))
     assert set(range(45, 73)) <= set(wanted)
