@@ -1,4 +1,4 @@
-"""What OpenCV does not do for a video: find interlaced streams, and decode by PyAV.
+"""Finding interlaced streams, and decoding by PyAV: what OpenCV does not do for a video.
 
 PyAV reads HDR (HLG, PQ), which OpenCV's decoder cuts to 8 flat bits, codecs that OpenCV does not have, tracks behind
 the first, and interlaced video: each frame holds two fields (half pictures) of different times, or is one. OpenCV's
