@@ -91,10 +91,12 @@ def _conversion(profile: bytes, mode: str) -> tuple[str, ImageCms.ImageCmsTransf
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         space = _SPACES.get(source.profile.xcolor_space, "")
         if space != mode and (space, mode) != ("RGB", "L"):
-            raise UnusableProfile(f"its colour profile is for {source.profile.xcolor_space.strip()}, it is {mode}")
+            raise UnusableProfile("its colour profile is of another kind of colours")
         intent = ImageCms.Intent.PERCEPTUAL if space == "CMYK" else ImageCms.Intent.RELATIVE_COLORIMETRIC
         transform = ImageCms.buildTransform(source, _srgb_profile(), space, "RGB", intent)
-    except (ImageCms.PyCMSError, OSError, TypeError, AttributeError) as error:
+    except UnusableProfile:
+        raise
+    except (ImageCms.PyCMSError, OSError, TypeError, AttributeError, ValueError) as error:
         raise UnusableProfile("its colour profile is damaged") from error
     return None if space != "CMYK" and _is_identity(transform, space) else (space, transform)
 

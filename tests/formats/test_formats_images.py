@@ -482,11 +482,12 @@ def test_srgb_stays_as_it_is_byte_for_byte(tmp_path: Path, patches: np.ndarray, 
     assert is_plain(tmp_path / "a.png")
 
 
-@pytest.mark.parametrize("damage", ["cut", "noise", "lab"])
+@pytest.mark.parametrize("damage", ["cut", "noise", "lab", "no text"])
 def test_an_unusable_profile_changes_nothing_and_is_named(tmp_path: Path, patches: np.ndarray, damage: str) -> None:
     whole = icc_profile(P3_IN_XYZ, 2.2)
     profile = {
         "cut": whole[:200],
+        "no text": whole[:16] + b"\xff" * 4 + whole[20:],
         "noise": np.random.default_rng(0).bytes(500),
         "lab": ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes(),
     }[damage]
