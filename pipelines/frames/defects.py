@@ -94,4 +94,4 @@ def _shift(
         weight = np.repeat(1 / np.sqrt(1 + (left.reshape(-1, 2) ** 2).sum(1)), 2)
     held = np.linalg.lstsq(system[:, :6] * weight[:, None], wanted * weight, rcond=None)[0]
     before = float((((wanted - system[:, :6] @ held) * weight) ** 2).sum())
-    return solved[6:], 1 - float(((left * weight) ** 2).sum()) / max(before, 1e-12)
+    return np.asarray(solved[6:], np.float64), 1 - float(((left * weight) ** 2).sum()) / max(before, 1e-12)
