@@ -106,6 +106,11 @@ class Outcome:
         return source.is_dir() or (source.suffix == "" and not source.exists())
 
     @property
+    def is_timed(self) -> bool:
+        """Whether the frames have the source's times; else these count the frames."""
+        return bool(self.records["frames"].figures.get("timed", True))
+
+    @property
     def keyframe_psnr(self) -> float | None:
         """See `keyframe_psnr`."""
         return keyframe_psnr(self.records)

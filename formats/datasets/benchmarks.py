@@ -20,8 +20,8 @@ from ..textfile import read_table, read_text
 from ..trajectory import clean_poses, poses_from_quaternions, read_matrices, read_tum
 from .calibration import read_intrinsics_json
 from .matching import (
-    ASSUMED_RATE,
     SAME_INSTANT_SECONDS,
+    SENSOR_RATE,
     classes_found,
     files_for_images,
     nearest_index,
@@ -68,7 +68,7 @@ def open_seven_scenes(path: Path) -> Sequence:
     size = image_size(first_readable(images))
     return sequence_of(
         "7scenes", path, images,
-        timestamps=np.array(numbers, dtype=np.float64) / ASSUMED_RATE,
+        timestamps=np.array(numbers, dtype=np.float64) / SENSOR_RATE,
         camera=_seven_scenes_camera(path / "camera-intrinsics-color.txt", size, _COLOR_FOCAL),
         world_from_cam=np.stack([_seven_scenes_pose(p) for p in images]),
         depth_paths=files_for_images(images, path, "*.depth.png"),

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..image_folder import count_images, list_images
+from ..image_folder import count_images, list_images, read_image_times
 from ..textfile import read_rows
 from ..trajectory import read_matrices, read_tum
 from .calibration import read_intrinsics_json
-from .matching import classes_found, files_for_images, poses_at, poses_for_images, sequence_of, times_or_frame_numbers
+from .matching import classes_found, files_for_images, poses_at, poses_for_images, sequence_of
 from .sequence import Camera, LabelClass, Sequence, known_classes
 
 _IMAGE_FOLDERS = ("rgb", "images", "color", "frames")
@@ -39,21 +39,21 @@ def open_folder(path: Path) -> Sequence:
         raise InputError(f"no images in {path}: give the folder that holds the images, or one above rgb/ or images/")
     images = list_images(folder)
     root = path if folder != path else _root_of(folder)
-    times, timed = times_or_frame_numbers(images)
+    times = read_image_times(images)
+    poses, left_out = _poses(images, times, root)
     camera, depth_scale = _camera(root)
     depth_paths = _first(images, root, _DEPTH_FOLDERS)
     label_paths = _first(images, root, _LABEL_FOLDERS)
     return sequence_of(
         "folder", root, images,
         timestamps=times,
-        timed=timed,
         camera=camera,
-        world_from_cam=_poses(images, times, root),
+        world_from_cam=poses,
         depth_paths=depth_paths,
         depth_per_metre=depth_scale or 1000.0,
         label_paths=label_paths,
         classes=_classes(root, label_paths),
-        notes=_unused_images(counts, folder),
+        notes=_unused_images(counts, folder) + left_out,
     )  # fmt: skip
 
 
@@ -100,14 +100,23 @@ def _first(images: list[Path], root: Path, folders: tuple[str, ...]) -> tuple[Pa
     return files_for_images(images, existing[0]) if existing else ()
 
 
-def _poses(images: list[Path], times: NDArray[np.float64], root: Path) -> NDArray[np.float64] | None:
+def _poses(
+    images: list[Path], times: NDArray[np.float64] | None, root: Path
+) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
+    """(N, 4, 4) poses, None without any, and a note where there are some that cannot be assigned."""
     path = next((root / name for name in _POSE_FILES if (root / name).is_file()), None)
     if path is None:
-        return None
+        return None, ()
     rows = read_rows(path)
-    if rows and len(rows[0]) == 8:
-        return poses_at(times, *read_tum(path))
-    return poses_for_images(images, read_matrices(path), path)
+    if not rows or len(rows[0]) != 8:
+        return poses_for_images(images, read_matrices(path), path), ()
+    pose_times, poses = read_tum(path)
+    if times is not None:
+        return poses_at(times, pose_times, poses), ()
+    if len(poses) == len(images):
+        return poses, ()
+    why = f"the {len(poses)} poses of {path.name} belong to times, and the {len(images)} images state none"
+    return None, (f"{why}: the poses are not used; timestamps.txt with a line for each image would tell",)
 
 
 def _classes(root: Path, label_paths: tuple[Path | None, ...]) -> tuple[LabelClass, ...]:

@@ -16,8 +16,8 @@ from ..reading import resolve_within
 from ..textfile import read_rows
 from .sequence import LabelClass, Sequence, used_label_ids
 
-ASSUMED_RATE = 30.0
-"""Frames per second where a data set does not say."""
+SENSOR_RATE = 30.0
+"""Frames per second of the sensors of benchmarks that number their frames and state no times."""
 
 SAME_INSTANT_SECONDS = 0.02
 """Two sensors' measurements at most this far apart belong together: half a frame at 25 a second."""
@@ -116,24 +116,24 @@ def nearest_index(sorted_times: NDArray[np.float64], times: NDArray[np.float64])
 
 
 def sequence_of(format: str, root: Path, images: list[Path], **fields: Any) -> Sequence:
-    """Make the sequence of image files, called as they are, at the times that they or their names state, unless the
-    other `fields` say otherwise."""
+    """Make the sequence of image files, called as they are, at the times that they state, unless the other `fields` say
+    otherwise."""
     if "timestamps" not in fields:
-        fields["timestamps"], fields["timed"] = times_or_frame_numbers(images)
+        fields["timestamps"] = read_image_times(images)
     names = fields.pop("names", tuple(p.name for p in images))
     return Sequence(format, root, names, image_paths=tuple(images), **fields)
 
 
-def times_or_frame_numbers(images: list[Path]) -> tuple[NDArray[np.float64], bool]:
-    """Return (N,) seconds: the images' own times, else their frame numbers (else their order) over `ASSUMED_RATE`; and
-    whether they are the images' own."""
+def times_at_sensor_rate(images: list[Path]) -> NDArray[np.float64]:
+    """Return (N,) seconds of a benchmark's images: their own times, else their frame numbers (else their order) over
+    `SENSOR_RATE`."""
     times = read_image_times(images)
     if times is not None:
-        return times, True
+        return times
     numbers = [frame_number(p) for p in images]
     usable = all(a is not None and b is not None and a < b for a, b in itertools.pairwise(numbers))
     counts = numbers if usable and numbers[0] is not None else list(range(len(images)))
-    return np.array(counts, dtype=np.float64) / ASSUMED_RATE, False
+    return np.array(counts, dtype=np.float64) / SENSOR_RATE
 
 
 def classes_found(paths: tuple[Path | None, ...]) -> tuple[LabelClass, ...]:

@@ -15,7 +15,7 @@ from ..images import MAX_IMAGE_PIXELS, decode_rgb, first_readable, image_size
 from ..reading import opened, require_file
 from ..textfile import read_table
 from ..trajectory import clean_poses, read_matrices
-from .matching import ASSUMED_RATE, classes_found, files_for_images, sequence_of, times_or_frame_numbers
+from .matching import classes_found, files_for_images, sequence_of, times_at_sensor_rate
 from .sequence import Camera, LabelClass, Sequence, find_label_table, read_nyu40_classes
 
 _VERSION = 4
@@ -47,7 +47,7 @@ def open_scannet(path: Path) -> Sequence:
     first_depth = next((p for p in depth_paths if p is not None), None)
     return sequence_of(
         "scannet", path, images,
-        timestamps=times_or_frame_numbers(images)[0],  # the frame numbers count at the sensor's 30 a second
+        timestamps=times_at_sensor_rate(images),
         camera=_camera(path / "intrinsic" / "intrinsic_color.txt", first_readable(images), _COLOR_SIZE),
         world_from_cam=np.stack([_pose(path / "pose" / f"{p.stem}.txt") for p in images]),
         depth_paths=depth_paths,
@@ -153,8 +153,7 @@ def open_sens(path: Path) -> Sequence:
         format="sens",
         root=path,
         names=tuple(f"{i:06d}.jpg" for i in range(count)),
-        timestamps=(times - times[0]) * _MICROSECONDS if increasing else np.arange(count) / ASSUMED_RATE,
-        timed=increasing,
+        timestamps=(times - times[0]) * _MICROSECONDS if increasing else None,
         camera=scaled_camera(header.color_matrix, header.color_size, header.color_size),
         world_from_cam=clean_poses(poses, str(path)),
         depth_camera=scaled_camera(header.depth_matrix, header.depth_size, header.depth_size),

@@ -68,11 +68,11 @@ class FrameStore(Protocol):
 class Sequence:
     """N frames of one camera.
 
-    names: N file names, unique. timestamps (N,) seconds, strictly increasing; `timed` says whether they were measured
-    (or counted at the sensor's known rate), else they only give the order. image_paths: N paths, or none where
-    `store` holds the frames. camera: None where unknown. world_from_cam (N, 4, 4) float64 with exact rotations,
-    camera axes x right, y down, z forward; NaN for a frame without a pose; None without any. `metric` says whether
-    its lengths are metres. depth_paths, label_paths: N paths, None for a frame without; empty without any.
+    names: N file names, unique, in order. timestamps (N,) seconds, strictly increasing, as measured or counted at the
+    sensor's known rate; None where unknown. image_paths: N paths, or none where `store` holds the frames. camera: None
+    where unknown. world_from_cam (N, 4, 4) float64 with exact rotations, camera axes x right, y down, z forward; NaN
+    for a frame without a pose; None without any. `metric` says whether the unit of the poses is the metre, else it is
+    any. depth_paths, label_paths: N paths, None for a frame without; empty without any.
     depth_camera: the camera of the depth images where that is another one than `camera`. Depth in metres is
     raw / depth_per_metre, unknown where raw is one of depth_invalid. classes: what `labels` gives indices into.
     notes: what a user should know about this recording, one sentence each.
@@ -81,11 +81,10 @@ class Sequence:
     format: str
     root: Path
     names: tuple[str, ...]
-    timestamps: NDArray[np.float64]
+    timestamps: NDArray[np.float64] | None
     image_paths: tuple[Path, ...] = ()
     camera: Camera | None = None
     world_from_cam: NDArray[np.float64] | None = None
-    timed: bool = True
     metric: bool = True
     depth_paths: tuple[Path | None, ...] = ()
     depth_camera: Camera | None = None
@@ -102,8 +101,7 @@ class Sequence:
             raise InputError(f"no frames in {self.root}: check that the data set was unpacked completely")
         if len(set(self.names)) != n:
             raise InputError(f"{self.root}: two frames have the same file name: rename one")
-        increasing = self.timestamps.shape == (n,) and bool((np.diff(self.timestamps) > 0).all())
-        if not increasing or not np.isfinite(self.timestamps).all():
+        if self.timestamps is not None and not _is_increasing(self.timestamps, n):
             raise InputError(f"{self.root}: the frames' timestamps do not increase: sort the image list by time")
         if not _UNITS_PER_METRE[0] <= self.depth_per_metre <= _UNITS_PER_METRE[1]:
             raise InputError(
@@ -180,6 +178,10 @@ class Sequence:
             return self.store.raw_depth(index)
         path = self.depth_paths[index] if self.depth_paths else None
         return None if path is None else read_depth_png(path)
+
+
+def _is_increasing(times: NDArray[np.float64], count: int) -> bool:
+    return times.shape == (count,) and bool(np.isfinite(times).all() and (np.diff(times) > 0).all())
 
 
 def used_label_ids(paths: Iterable[Path]) -> set[int]:

@@ -1,7 +1,7 @@
 """A run against the truth: every cell of the table, or why it is empty."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,8 +26,9 @@ from .truth import (
     ErrorStatistics,
     MatchedTruth,
     absolute_error,
+    has_times,
     match_by_time,
-    match_truth,
+    match_outcome,
     relative_error,
 )
 from .views import MapView, render_outcome
@@ -40,6 +41,9 @@ SLOPE_PX, NOISE, MAX_STEPS = 0.2, 0.02, 10
 """Pixels by which the image moves to measure its slopes; colour difference, of 1, that counts linearly beyond; steps.
 In a room of noise 0.02, from 1 cm and 0.3 degrees: within 0.15 mm of the true pose after 7 steps."""
 
+FREE_UNIT = "units of the truth"
+FREE_TRUTH = "the truth's poses have no metric scale"
+
 PROTOCOL = (
     "Frames belong to the truth of the same {by}; the other frames count as picked and posed only.",
     "ATE: distance of camera centres after one alignment (Umeyama) over the frames it is given for: all picked ones, "
@@ -50,12 +54,13 @@ PROTOCOL = (
     "the run found; mean over views; LPIPS on AlexNet where the extra is installed. Refined poses are those from which "
     "the map looks most like the image; true poses are carried into the run's world by the alignment.",
     "Depth of the map: the surface at which half the light is lost, against the true depth at the same pixel, over "
-    "all views with true depth; pixels without either are left out of L1 and shown as the valid fraction.",
+    "all views with true depth; of a single view in metres, after the one scale unless the run is metric; pixels "
+    "without either are left out of L1 and shown as the valid fraction.",
     "Labels: one confusion matrix over all views; pixels without a true class are left out, pixels to which the map "
     "gives no class count as wrong; the mean is over the classes that occur in the truth. Where a class map joins "
     "names that differ, these are the classes that both sides know, and pixels of others are left out.",
-    "Mesh: points spread evenly over it, after Sim(3) (SE(3) where the depth is metric), where a camera with true "
-    "depth sees them; the truth is the points of the true depth.",
+    "Mesh: points spread evenly over it, after Sim(3) (SE(3) where depth and truth are metric), where a camera with "
+    "true depth sees them; the truth is the points of the true depth.",
 )
 
 
@@ -71,7 +76,7 @@ def evaluate_outcome(
     At most `max_views` of the keyframes, and as many of the other frames, are rendered. Raises InputError for a truth
     of which no frame belongs to the run, and for a class map that joins nothing here.
     """
-    matched = match_truth(outcome.frames, outcome.source_is_folder, truth)
+    matched = match_outcome(outcome, truth)
     if not matched.has_pose.any() and not (matched.image >= 0).any():
         raise InputError(
             f"{truth.root}: none of its {len(truth)} frames belongs to the {len(outcome.frames)} frames of "
@@ -93,11 +98,12 @@ def evaluate_outcome(
         "run": outcome.run.place.name,
         "truth": f"{truth.root.name} ({truth.format})",
         "stage": {"poses": outcome.pose_stage, "map": outcome.map_stage or "none"},
+        "unit": "m" if truth.metric else FREE_UNIT,
         "protocol": [line.format(by=matched.by) for line in PROTOCOL],
         "frames": frame_cells(outcome, matched),
         "camera": camera_cells(outcome, truth),
         "trajectory": trajectory,
-        "scale": scale_cells(outcome, trajectory),
+        "scale": scale_cells(outcome, trajectory, truth),
         "frame errors": frame_errors(outcome, matched, alignment),
         "keyframe psnr": outcome.keyframe_psnr,
         **of_map,
@@ -134,7 +140,8 @@ def camera_cells(outcome: Outcome, truth: Sequence) -> dict[str, Any]:
 
 
 def trajectory_cells(outcome: Outcome, matched: MatchedTruth) -> tuple[dict[str, Any], AbsoluteError | None]:
-    """ATE and RPE, and the Sim(3) alignment over all frames (SE(3) where the depth is metric)."""
+    """ATE and RPE in the truth's unit, and the Sim(3) alignment over all frames (SE(3) where depth and truth are
+    metric)."""
     t = outcome.trajectory
     usable = t.is_placed & matched.has_pose
     if usable.sum() < 3:
@@ -147,20 +154,23 @@ def trajectory_cells(outcome: Outcome, matched: MatchedTruth) -> tuple[dict[str,
             cells[f"{name} {frames}"] = _ate(estimate[rows, :3, 3], truth[rows, :3, 3], with_scale)
         if outcome.every is not None:
             cells[f"{name} every image"] = _ate_of_every(outcome.every, matched.sequence, with_scale)
-    if not outcome.metric:
+    is_metric = outcome.metric and matched.sequence.metric
+    if not is_metric:
         for key in [key for key in cells if key.startswith("se3")]:
-            cells[key] = {"missing": "the run has no metric scale"}
+            cells[key] = {"missing": FREE_TRUTH if outcome.metric else "the run has no metric scale"}
     try:
         sim3 = absolute_error(estimate[usable, :3, 3], truth[usable, :3, 3], with_scale=True)
     except ValueError as error:
         return {"missing": str(error)}, None
     cells["rpe"] = _rpe(estimate[usable], truth[usable], sim3.alignment.scale)
-    best = absolute_error(estimate[usable, :3, 3], truth[usable, :3, 3], False) if outcome.metric else sim3
+    best = absolute_error(estimate[usable, :3, 3], truth[usable, :3, 3], False) if is_metric else sim3
     return cells, best
 
 
-def scale_cells(outcome: Outcome, trajectory: dict[str, Any]) -> dict[str, Any]:
+def scale_cells(outcome: Outcome, trajectory: dict[str, Any], truth: Sequence) -> dict[str, Any]:
     """The metres per unit that the run states, with their relative sd, beside the true ones by Sim(3)."""
+    if not truth.metric:
+        return {"missing": FREE_TRUTH}
     found = trajectory.get("sim3 all", trajectory)
     if "missing" in found:
         return {"missing": found["missing"]}
@@ -173,7 +183,7 @@ def scale_cells(outcome: Outcome, trajectory: dict[str, Any]) -> dict[str, Any]:
 
 
 def frame_errors(outcome: Outcome, matched: MatchedTruth, alignment: AbsoluteError | None) -> list[list[float]]:
-    """[frame id, metres] of every frame that the alignment was made from."""
+    """[frame id, error in the truth's unit] of every frame that the alignment was made from."""
     if alignment is None:
         return []
     ids = outcome.trajectory.frame_ids[outcome.trajectory.is_placed & matched.has_pose]
@@ -189,6 +199,8 @@ def _ate(centers: NDArray, true_centers: NDArray, with_scale: bool) -> dict[str,
 
 
 def _ate_of_every(every: Trajectory, sequence: Sequence, with_scale: bool) -> dict[str, Any]:
+    if not has_times(sequence):
+        return {"missing": "the truth has no times"}
     truth = match_by_time(every.timestamps, sequence)
     rows = every.is_placed & truth.has_pose
     return _ate(every.centers[rows], truth.world_from_cam[rows, :3, 3], with_scale)
@@ -217,16 +229,21 @@ def cost_cells(outcome: Outcome) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class MeasuredView:
-    """One rendered frame; lpips NaN where it cannot be had; depth_l1 in the run's unit, NaN without truth.
-    label_accuracy: share of the pixels with a true class that have it; NaN where the classes' names differ."""
+    """One rendered frame; lpips NaN where it cannot be had. label_accuracy: share of the pixels with a true class that
+    have it; NaN where the classes' names differ."""
 
     frame_id: int
     kind: str
     psnr: float
     ssim: float
     lpips: float
-    depth_l1: float
     label_accuracy: float
+
+    @property
+    def is_new_pose(self) -> bool:
+        """Whether the pose is another than the run's: only the image is compared, depth and labels count once a
+        frame."""
+        return self.kind.endswith((AT_TRUE_POSES, AT_REFINED_POSES))
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures by name, with None for NaN."""
@@ -240,6 +257,7 @@ class Measured:
         self.views: list[MeasuredView] = []
         self.lpips = open_lpips()
         self.depth = DepthErrorSum()
+        self.depth_frames: list[int] = []
         self.matching = matching
         self.confusion: Counts = np.zeros((len(true_names), len(names) + 1), np.int64)
 
@@ -265,15 +283,17 @@ class Measured:
         """The groups images, depth, labels and views of the result."""
         depth = self.depth.result()
         depth_cells: dict[str, Any] = {"missing": "no rendered view has a true depth"}
+        l1_of: dict[int, float | None] = {}
         if depth is not None:
             depth_cells = asdict(depth)
             if not outcome.metric:
                 depth_cells["metric_l1"] = {"missing": "the run has no metric scale"}
+            l1_of = dict(zip(self.depth_frames, self.depth.l1(1.0 if outcome.metric else depth.scale), strict=True))
         return {
             "images": self.images(),
             "depth": depth_cells,
             "labels": label_cells(self.confusion, self.matching, outcome.semantics, matched.sequence.class_names),
-            "views": [v.to_json() for v in self.views],
+            "views": [v.to_json() | {"depth_l1": None if v.is_new_pose else l1_of.get(v.frame_id)} for v in self.views],
         }
 
 
@@ -378,23 +398,17 @@ def _measure(
     left_out = outcome.run.left_out(frame)
     if left_out is not None:  # what is no part of the scene is not judged
         photo = np.where(left_out[..., None], picture, photo)
-    depth_l1 = accuracy = float("nan")
-    # At other poses only the image is compared: depth and labels count once a frame.
-    if matched.image[row] >= 0 and not kind.endswith((AT_TRUE_POSES, AT_REFINED_POSES)):
-        index = int(matched.image[row])
-        if (depth := matched.sequence.depth(index)) is not None:
-            depth_l1 = _add_depth(measured, view, pixels.sample(depth))
-        if (labels := matched.sequence.labels(index)) is not None:
-            accuracy = _add_labels(measured, view, pixels.sample(labels))
     perceived = float("nan") if isinstance(measured.lpips, str) else measured.lpips(picture, photo)
     likeness = psnr(picture, photo, None if left_out is None else ~left_out)
-    return MeasuredView(frame_id, kind, likeness, ssim(picture, photo), perceived, depth_l1, accuracy)
-
-
-def _add_depth(measured: Measured, view: MapView, truth: NDArray[np.float32]) -> float:
-    measured.depth.add(view.depth, truth)
-    both = (truth > 0) & (view.depth > 0)
-    return float(np.abs(view.depth - truth)[both].mean()) if both.any() else float("nan")
+    result = MeasuredView(frame_id, kind, likeness, ssim(picture, photo), perceived, float("nan"))
+    if (index := int(matched.image[row])) < 0 or result.is_new_pose:
+        return result
+    if (depth := matched.sequence.depth(index)) is not None:
+        measured.depth.add(view.depth, pixels.sample(depth))
+        measured.depth_frames.append(frame_id)
+    if (labels := matched.sequence.labels(index)) is not None:
+        result = replace(result, label_accuracy=_add_labels(measured, view, pixels.sample(labels)))
+    return result
 
 
 def _add_labels(measured: Measured, view: MapView, truth: NDArray[np.uint8]) -> float:

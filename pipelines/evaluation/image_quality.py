@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...formats.errors import InputError, install_command
+from ...formats.errors import InputError, install_extra
 from ...formats.reading import file_sha256
 from ..compute.ssim import TAPS, similarity
 from ..networks.registry import Model, ModelStore
@@ -90,7 +90,7 @@ def _by_package() -> Lpips | str:
         import lpips
         from torchvision.models import AlexNet_Weights
     except ImportError:
-        package = install_command("msgs-slam[lpips]")
+        package = install_extra("lpips")
         return f"needs its package ({package}) or the model lpips-alex: msgs-slam models pull --from FOLDER"
     except RuntimeError as error:  # torchvision of another build than torch
         return f"the package lpips cannot be loaded: {error}"
@@ -125,11 +125,7 @@ class DepthError:
 
 
 class DepthErrorSum:
-    """Depth L1 over a sequence, frame by frame.
-
-    Depths are first multiplied by the scale of the trajectory's alignment where the caller asks for it; the one scale
-    of `scaled_l1` is the median of truth / depth over a sample of all pixels.
-    """
+    """Depth L1 over a sequence, frame by frame; its scale is the median of truth / depth of a sample of all pixels."""
 
     def __init__(self, samples_a_frame: int = 20000) -> None:
         self._samples_a_frame = samples_a_frame
@@ -139,7 +135,7 @@ class DepthErrorSum:
         self._samples: list[NDArray[np.float32]] = []
 
     def add(self, depth: NDArray[np.float32], truth: NDArray[np.float32]) -> None:
-        """One frame, both (H, W) in metres, 0 = unknown."""
+        """Add a frame, (H, W) `depth` in its world's unit and `truth` in metres, 0 = unknown."""
         require_shape("depth", depth, truth.shape)
         known = truth > 0
         both = known & (depth > 0) & np.isfinite(depth)
@@ -149,6 +145,10 @@ class DepthErrorSum:
         pairs = np.stack([depth[both], truth[both]], axis=1)
         # Every k-th pixel: even over the image, and the same on every run.
         self._samples.append(pairs[:: max(1, len(pairs) // self._samples_a_frame)])
+
+    def l1(self, scale: float) -> list[float | None]:
+        """Return the mean of |scale * depth - truth| of each added frame, over its sample; None where none is known."""
+        return [float(np.abs(scale * s[:, 0] - s[:, 1]).mean()) if len(s) else None for s in self._samples]
 
     def result(self) -> DepthError | None:
         """None where no pixel could be compared."""

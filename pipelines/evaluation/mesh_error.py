@@ -100,6 +100,8 @@ def mesh_cells(outcome: Outcome, matched: MatchedTruth, alignment: AbsoluteError
     """Accuracy, completeness and F-score, or why not."""
     if not outcome.run.has("export", MESH):
         return {"missing": "no mesh was exported"}
+    if not matched.sequence.metric:
+        return {"missing": "the truth's poses have no metric scale, its depth has"}
     if alignment is None:
         return {"missing": "the poses could not be aligned with the truth"}
     truth, views = true_surface(matched)

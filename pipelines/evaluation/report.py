@@ -216,8 +216,9 @@ def _truth_section(evaluation: dict[str, Any], run: RunFolder) -> str:
     errors = np.array(evaluation.get("frame errors", []), np.float64).reshape(-1, 2)
     drawn = ""
     if len(errors):
-        points = np.stack([errors[:, 0], 100 * errors[:, 1]], axis=1)
-        drawn = plot("Distance from the true camera", "frame", "cm", [Line(points, RED, "")])
+        per_unit, unit = (100.0, "cm") if evaluation["unit"] == "m" else (1.0, evaluation["unit"])
+        points = np.stack([errors[:, 0], per_unit * errors[:, 1]], axis=1)
+        drawn = plot("Distance from the true camera", "frame", unit, [Line(points, RED, "")])
     beside = run.evaluation_file.with_name(PATH_FROM_ABOVE)
     drawn += drawing(read_bytes(beside), "The camera path from above") if beside.exists() else ""
     return section(

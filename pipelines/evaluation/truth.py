@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.datasets import Sequence
+from ...formats.errors import InputError
+from ...formats.image_folder import frame_number
 from ...formats.textfile import read_rows
-from ...formats.trajectory import read_matrices
+from ...formats.trajectory import read_matrices, read_tum
 from ..geometry import se3
 from ..geometry.se3 import Similarity, align_points
+from ..outcome import Outcome, spread_sample
 from ..source.recording import written_name
 from ..types import Array, Frame, require_shape
 
 _MAX_SECONDS_APART = 0.02
+_MIN_PAIRS = 3
+_COMPARED, _THUMBNAIL, _ALIKE = 12, 32, 0.9
+"""Pairs whose images are compared, as grey thumbnails of so many pixels a side, and the median correlation below which
+they are not of the same instants. The same image through another lens model and JPEG: above 0.98; frames a second apart
+of a camera that walks: 0.2 to 0.7."""
 
 
 @dataclass(frozen=True)
@@ -34,30 +44,95 @@ class MatchedTruth:
         return np.asarray(np.isfinite(self.world_from_cam).all(axis=(1, 2)))
 
 
-def match_truth(frames: list[Frame], names_are_the_sources: bool, sequence: Sequence) -> MatchedTruth:
-    """By file name where the frames kept their names and most are there, else by time.
+def match_truth(
+    frames: list[Frame],
+    names_are_the_sources: bool,
+    sequence: Sequence,
+    image_of: Callable[[Frame], NDArray[np.uint8]] | None = None,
+    is_timed: bool = True,
+) -> MatchedTruth:
+    """Match by file name where the frames kept their names and most are there; else by time; else, where the truth or
+    the run (`is_timed`) has no times, by the name or number under which the images look the same.
 
-    Times may differ by a constant: a video counts from its beginning, some data sets from 1970.
+    Times may differ by a constant: a video counts from its beginning, some data sets from 1970. Raises InputError where
+    there are neither times nor such names, or no `image_of` (the frame's (H, W, 3) pixels) to compare.
     """
     index_of = {written_name(name): i for i, name in enumerate(sequence.names)}
-    found = [index_of.get(f.name, -1) for f in frames]
-    if names_are_the_sources and sum(i >= 0 for i in found) > 0.5 * len(frames):
-        image = np.array(found, np.int64)
-        poses = np.full((len(frames), 4, 4), np.nan)
-        if sequence.world_from_cam is not None:
-            poses[image >= 0] = sequence.world_from_cam[image[image >= 0]]
-        return MatchedTruth(sequence, poses, image, "file name")
-    return match_by_time(np.array([f.timestamp for f in frames]), sequence)
+    by_name = np.array([index_of.get(f.name, -1) for f in frames], np.int64)
+    if names_are_the_sources and (by_name >= 0).mean() > 0.5:
+        return _match_images(by_name, sequence, "file name")
+    if is_timed and has_times(sequence):
+        return match_by_time(np.array([f.timestamp for f in frames]), sequence)
+    kinds = {"file name": by_name} | _by_numbers(frames, names_are_the_sources, sequence)
+    kinds = {by: image for by, image in kinds.items() if (image >= 0).sum() >= min(_MIN_PAIRS, len(sequence))}
+    alike = {by: _likeness(frames, image, sequence, image_of) for by, image in kinds.items()} if image_of else {}
+    best = max(alike, key=alike.__getitem__, default="")
+    if alike.get(best, 0.0) < _ALIKE:
+        without = "its images have no times" if is_timed else "the images of the run have no times"
+        raise InputError(
+            f"{sequence.root}: {without}, and neither the names nor the numbers of its {len(sequence)} images "
+            f"({sequence.names[0]} first) lead to images of the run ({frames[0].name} first) that look the same. "
+            + ("Add timestamps.txt with the seconds of each image, or name" if is_timed else "Name")
+            + " the images as the run's are"
+        )
+    return _match_images(kinds[best], sequence, best)
+
+
+def match_outcome(outcome: Outcome, sequence: Sequence) -> MatchedTruth:
+    """Match the frames of a run, see `match_truth`."""
+    return match_truth(outcome.frames, outcome.source_is_folder, sequence, outcome.run.image, outcome.is_timed)
+
+
+def _match_images(image: NDArray[np.int64], sequence: Sequence, by: str) -> MatchedTruth:
+    poses = np.full((len(image), 4, 4), np.nan)
+    if sequence.world_from_cam is not None:
+        poses[image >= 0] = sequence.world_from_cam[image[image >= 0]]
+    return MatchedTruth(sequence, poses, image, by)
+
+
+def _by_numbers(frames: list[Frame], names_are_the_sources: bool, sequence: Sequence) -> dict[str, NDArray[np.int64]]:
+    """Images by the number in their name: that in the frame's name, or a video's frame, counted from 0 or 1."""
+    index_of = {frame_number(Path(name)): i for i, name in enumerate(sequence.names)}
+    if len(index_of) < len(sequence) or None in index_of:
+        return {}
+    if names_are_the_sources:
+        numbers: dict[str, list[int | None]] = {"frame number": [frame_number(Path(f.name)) for f in frames]}
+    else:
+        numbers = {
+            "frame number": [f.source_index for f in frames],
+            "frame number, counted from 1": [f.source_index + 1 for f in frames],
+        }
+    return {by: np.array([index_of.get(n, -1) for n in found], np.int64) for by, found in numbers.items()}
+
+
+def _likeness(
+    frames: list[Frame], image: NDArray[np.int64], sequence: Sequence, image_of: Callable[[Frame], NDArray[np.uint8]]
+) -> float:
+    """Median correlation of grey thumbnails of matched images."""
+
+    def thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float64]:
+        small = cv2.resize(rgb, (_THUMBNAIL, _THUMBNAIL), interpolation=cv2.INTER_AREA).astype(np.float64).mean(axis=2)
+        return (small - small.mean()) / max(float(small.std()), 1e-6)
+
+    rows = spread_sample(np.flatnonzero(image >= 0).tolist(), _COMPARED)
+    pairs = [(thumbnail(image_of(frames[r])), thumbnail(sequence.rgb(int(image[r])))) for r in rows]
+    return float(np.median([(a * b).mean() for a, b in pairs]))
+
+
+def has_times(sequence: Sequence) -> bool:
+    """Whether images or poses of the truth have times."""
+    return sequence.timestamps is not None or _dense_trajectory(sequence.root) is not None
 
 
 def match_by_time(times: NDArray[np.float64], sequence: Sequence) -> MatchedTruth:
-    """Truth of the instants (N,) in seconds, which may differ from the sequence's by a constant."""
+    """Match the instants (N,) in seconds, which may differ from the sequence's by a constant; `has_times` of it."""
     pose_times, true_poses = true_trajectory(sequence)
-    start = 0.0
-    if sequence.timestamps[0] > times[-1] + 1:
-        start = float(min(sequence.timestamps[0], pose_times[0] if len(pose_times) else np.inf))
+    image_times = np.zeros(0) if sequence.timestamps is None else sequence.timestamps
+    first, start = min((t[0] for t in (image_times, pose_times) if len(t)), default=0.0), 0.0
+    if first > times[-1] + 1:
+        start = float(first)
     image = np.full(len(times), -1, np.int64)
-    i, j = associate(times, sequence.timestamps - start, _tolerance(sequence.timestamps))
+    i, j = associate(times, image_times - start, _tolerance(image_times))
     image[i] = j
     poses = np.full((len(times), 4, 4), np.nan)
     i, j = associate(times, pose_times - start, _tolerance(pose_times))
@@ -77,17 +152,22 @@ def true_trajectory(sequence: Sequence) -> tuple[NDArray[np.float64], NDArray[np
     A recording may keep all its poses and times and only every k-th image.
     """
     dense = _dense_trajectory(sequence.root)
-    if dense is not None and len(dense[0]) > len(sequence):
+    if dense is not None and (sequence.timestamps is None or len(dense[0]) > len(sequence)):
         return dense
-    if sequence.world_from_cam is None:
+    if sequence.world_from_cam is None or sequence.timestamps is None:
         return np.zeros(0), np.zeros((0, 4, 4))
     known = sequence.has_pose
     return sequence.timestamps[known], sequence.world_from_cam[known]
 
 
 def _dense_trajectory(root: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Times and poses of traj.txt: of its TUM lines, or of its matrices at the times in timestamps.txt."""
     poses_file, times_file = root / "traj.txt", root / "timestamps.txt"
-    if not (poses_file.is_file() and times_file.is_file()):
+    if not poses_file.is_file():
+        return None
+    if len(next(iter(read_rows(poses_file)), ())) == 8:
+        return read_tum(poses_file)
+    if not times_file.is_file():
         return None
     rows = read_rows(times_file)
     poses = read_matrices(poses_file)
@@ -119,7 +199,7 @@ class ErrorStatistics:
 
 @dataclass(frozen=True)
 class AbsoluteError:
-    """errors (N,) metres between aligned estimate and truth, and truth_from_estimate."""
+    """errors (N,) between aligned estimate and truth in the truth's unit, and truth_from_estimate."""
 
     errors: Array
     alignment: Similarity
@@ -163,7 +243,7 @@ def absolute_error(centers: Array, true_centers: Array, with_scale: bool) -> Abs
 
 @dataclass(frozen=True)
 class RelativeError:
-    """translation (N - delta,) metres and rotation (N - delta,) degrees of the motion over `delta` frames."""
+    """translation (N - delta,) in the truth's unit, rotation (N - delta,) degrees of the motion over `delta` frames."""
 
     translation: Array
     rotation: Array

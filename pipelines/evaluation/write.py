@@ -14,10 +14,10 @@ from ..run.folder import RunFolder
 from ..sfm.lens import FramePixels
 from ..system.progress import Progress
 from ..system.wording import markdown_table
-from .evaluate import evaluate_outcome
+from .evaluate import FREE_UNIT, evaluate_outcome
 from .html import BLUE, GREY, Line, plot
 from .labels import ClassMap
-from .truth import MatchedTruth, match_truth
+from .truth import MatchedTruth, match_outcome
 from .views import (
     Picture,
     class_colors_by_name,
@@ -54,7 +54,7 @@ def write_evaluation(
     folder = run.evaluation_file.parent
     write_json(run.evaluation_file, result)
     write_text(folder / "evaluation.md", evaluation_table(result))
-    matched = match_truth(outcome.frames, outcome.source_is_folder, truth)
+    matched = match_outcome(outcome, truth)
     top, side = trajectory_plots(outcome, matched)
     write_text(folder / PATH_FROM_ABOVE, top)
     write_text(folder / PATH_FROM_THE_SIDE, side)
@@ -73,9 +73,12 @@ def trajectory_plots(outcome: Outcome, matched: MatchedTruth | None, upright: bo
     centers = np.where(t.is_posed[:, None], t.centers, np.nan)
     truth, unit = np.full_like(centers, np.nan), unit_name(outcome)
     if matched is not None and (both := t.is_posed & matched.has_pose).sum() >= 3:
-        found = _aligned(centers[both], matched.world_from_cam[both, :3, 3], not outcome.metric)
+        found = _aligned(
+            centers[both], matched.world_from_cam[both, :3, 3], not (outcome.metric and matched.sequence.metric)
+        )
         if found is not None:
-            centers, truth, unit = found.apply(centers), matched.world_from_cam[:, :3, 3], "m"
+            centers, truth = found.apply(centers), matched.world_from_cam[:, :3, 3]
+            unit = "m" if matched.sequence.metric else FREE_UNIT
     axes = np.eye(3) if upright else _main_axes(centers[np.isfinite(centers).all(axis=1)])
     plots = []
     for name, x, y in (("Camera path from above", 0, 1), ("Camera path from the side", 0, 2)):
@@ -170,7 +173,7 @@ def evaluation_rows(result: dict[str, Any]) -> list[Row]:
     if frames.get("by rotation alone"):
         of += f"; {frames['by rotation alone']} by rotation alone, which no error of a place counts"
     rows = [("frames posed", str(frames["posed"]), of), _camera_row(result["camera"])]
-    rows += _trajectory_rows(result["trajectory"], stage["poses"])
+    rows += _trajectory_rows(result["trajectory"], stage["poses"], result["unit"])
     rows += _scale_rows(result["scale"])
     if (psnr := result["keyframe psnr"]) is not None:
         rows.append(("PSNR at keyframes", f"{psnr:.2f} dB", "as in status and report: at the map's own image size"))
@@ -189,10 +192,16 @@ def _camera_row(camera: dict[str, Any]) -> Row:
     return ("focal length", f"{camera['fx']:.1f} px ({camera['focal error']:+.2%})", camera["origin"])
 
 
-def _trajectory_rows(cells: dict[str, Any], stage: str) -> list[Row]:
+def _trajectory_rows(cells: dict[str, Any], stage: str, unit: str) -> list[Row]:
     if "missing" in cells:
         return _missing("trajectory", cells)
     rows = []
+
+    def lengths(*values: float) -> str:
+        if unit != "m":
+            return " / ".join(f"{v:.3g}" for v in values) + f" {unit}"
+        return " / ".join(f"{100 * v:.2f}" for v in values) + " cm"
+
     for key, name in (("sim3", "ATE Sim(3)"), ("se3", "ATE SE(3)")):
         for frames in ("all", "keyframes", "every image"):
             if (cell := cells.get(f"{key} {frames}")) is None:
@@ -200,11 +209,11 @@ def _trajectory_rows(cells: dict[str, Any], stage: str) -> list[Row]:
             if "missing" in cell:
                 rows += _missing(f"{name}, {frames}", cell)
                 continue
-            text = " / ".join(f"{100 * cell[k]:.2f}" for k in ("rmse", "mean", "median", "max")) + " cm"
+            text = lengths(*(cell[k] for k in ("rmse", "mean", "median", "max")))
             scale = f", scale {cell['scale']:.4f}" if key == "sim3" else ""
             rows.append((f"{name}, {frames}: rmse / mean / median / max", text, f"{cell['frames']} frames{scale}"))
     rpe = cells["rpe"]
-    text = f"{100 * rpe['translation rmse']:.2f} cm, {rpe['rotation rmse degrees']:.3f}°"
+    text = f"{lengths(rpe['translation rmse'])}, {rpe['rotation rmse degrees']:.3f}°"
     return [*rows, ("RPE rmse", text, f"{rpe['pairs']} pairs, poses of {stage}")]
 
 

@@ -9,6 +9,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from ...formats.colmap import ModelArrays, pose_of
+from ...formats.errors import InputError
 from ..engine.stages import StageContext
 from ..geometry.sparse_model import SparseModel
 from ..run.extension import ParentRun
@@ -16,12 +17,14 @@ from ..sfm.adjust import focals_of_halves
 from ..sfm.candidates import GIVEN, GIVEN_ALONE
 from ..sfm.drift import MAX_DRIFT
 from ..sfm.driver import Structure
-from ..sfm.given import agreement
+from ..sfm.given import Agreement, agreement
 from ..sfm.lens import Lens
+from ..source.given import numbering
 from ..system.wording import stretches
 from ..types import Frame, GivenPoses
 
 _MIN_PART = 3
+_FEW_WRONG = 0.25
 _APART, _ZOOM, _OFF = 5.0, 0.03, 0.05
 """Standard deviations by which two focal lengths contradict each other, if they are also so far apart relatively: those
 of two halves of a recording, and one found beside one known before. Halves of five recordings without zoom: up to 3.2.
@@ -130,9 +133,12 @@ def warn_of_structure(context: StageContext, structure: Structure, ids: list[int
 
 
 def warn_of_given(
-    context: StageContext, structure: Structure, given: GivenPoses, keyframes: Sequence[int]
+    context: StageContext, structure: Structure, given: GivenPoses, frames: Sequence[Frame], keyframes: Sequence[int]
 ) -> dict[str, Any]:
-    """Figures of how the given poses agree with those found, with a warning where they carry them or contradict."""
+    """Figures of how the given poses agree with those found, with a warning where they carry them or some contradict.
+
+    Raises InputError where all of them contradict the images.
+    """
     placed = [i for i in sorted(structure.model.reg_image_ids()) if structure.model.images[i].num_points3D]
     ids = [i - 1 for i in placed if given.known[keyframes[i - 1]]]
     figures: dict[str, Any] = {"given_poses": int(given.known.sum()), "given_metric": given.is_metric}
@@ -153,6 +159,8 @@ def warn_of_given(
     if agreed is None:
         context.warn("the given poses cannot be compared with those found: too few, or they hardly move")
         return figures
+    if agreed.is_contradiction:
+        raise InputError(_other_poses(context, agreed, found, [frames[row] for row in rows]))
     wrong = [row for row, is_wrong in zip(rows, agreed.wrong, strict=True) if is_wrong]
     unit = " m" if given.is_metric else ""
     if wrong:
@@ -165,6 +173,29 @@ def warn_of_given(
         "given_degrees_sd": round(agreed.degrees_sd, 4),
         "given_wrong": wrong,
     }
+
+
+def _other_poses(context: StageContext, agreed: Agreement, found: NDArray[np.float64], frames: Sequence[Frame]) -> str:
+    def fits(given: NDArray[np.float64]) -> bool:
+        known = np.isfinite(given).all(axis=(1, 2))
+        again = agreement(found[known], given[known]) if 2 * int(known.sum()) > len(given) else None
+        return again is not None and not again.is_contradiction and not again.wrong.mean() > _FEW_WRONG
+
+    settings = context.config.frames
+    why = (
+        f"--poses {settings.poses}: the poses contradict the images, by {agreed.degrees_sd:.2g} degrees and "
+        f"{agreed.position_sd / agreed.extent:.0%} of the extent of their path: they belong to other images"
+    )
+    if named := numbering(settings, frames, fits):
+        return (
+            f"{why}. As poses of {named}, they agree: the images that they were made from are a selection, numbered "
+            "anew. Give that folder of images as the source, or name the poses by the numbers of the video's frames "
+            "(from 0)"
+        )
+    return (
+        f"{why}, or their camera axes are not those of their format. Check that their names, numbers or times are "
+        "those of this source, or omit --poses"
+    )
 
 
 def in_world_of(before: ParentRun, model: SparseModel, frames: Sequence[Frame]) -> SparseModel:

@@ -34,10 +34,12 @@ _MIN_SURVIVORS = 0.5
 @dataclass(frozen=True)
 class KeyframeChoice:
     """keyframes: indices of the chosen frames; displacement (N,): median displacement of each frame from the keyframe
-    before it, as a fraction of the longer side, infinite where the tracks were lost."""
+    before it, as a fraction of the longer side, infinite where the tracks were lost. has_detail: whether any frame has
+    enough corners to follow."""
 
     keyframes: list[int]
     displacement: NDArray[np.float64]
+    has_detail: bool
 
     @property
     def largest_displacement(self) -> float:
@@ -55,18 +57,18 @@ def choose_keyframes(
     tracker = _Tracker()
     keyframes: list[int] = []
     displacement: list[float] = []
-    count = 0
+    count, has_detail = 0, False
     for i, (frame, left_out) in enumerate(frames):
         gray = reduce_image(frame, _TRACKED_SIDE)
         moved, survivors = tracker.advance(gray)
         displacement.append(moved)
         if i == 0 or moved > parallax or survivors < _MIN_SURVIVORS:
             keyframes.append(i)
-            tracker.restart(gray, left_out)
+            has_detail |= tracker.restart(gray, left_out) >= _MIN_TRACKS
         count = i + 1
     if keyframes and keyframes[-1] != count - 1 and displacement[-1] > parallax / 3:
         keyframes.append(count - 1)
-    return KeyframeChoice(keyframes, np.array(displacement, dtype=np.float64))
+    return KeyframeChoice(keyframes, np.array(displacement, dtype=np.float64), has_detail)
 
 
 class _Tracker:
@@ -78,12 +80,13 @@ class _Tracker:
         self._points = np.zeros((0, 2))
         self._started = 0
 
-    def restart(self, gray: NDArray[np.uint8], left_out: NDArray[np.bool_] | None) -> None:
-        """Take `gray`, the frame advanced to last, as the keyframe."""
+    def restart(self, gray: NDArray[np.uint8], left_out: NDArray[np.bool_] | None) -> int:
+        """Take `gray`, the frame advanced to last, as the keyframe; return the number of its corners."""
         if left_out is not None:
             left_out = cv2.resize(left_out.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
         self._origin = self._points = corners(gray, self._origin[:0], _MAX_CORNERS, _APART_PX, left_out)
         self._started = len(self._origin)
+        return self._started
 
     def advance(self, gray: NDArray[np.uint8]) -> tuple[float, float]:
         """Median displacement since the keyframe (fraction of the longer side), and the share of its tracks alive."""

@@ -69,6 +69,7 @@ def run(context: StageContext) -> dict[str, Any]:
         if blame := masks.blame(frames, camera.width, camera.height):
             raise InputError(blame) from error
         raise
+    told = {} if given is None else warn_of_given(context, structure, given, frames, keyframes)
     lens = make_lens(structure.model.cameras[1])
     origin, focal_sd = settled_origin(context, origin, camera, structure), structure.focal_sd
     if len(rig) == 1:
@@ -88,9 +89,9 @@ def run(context: StageContext) -> dict[str, Any]:
     save_frames(context.folder, frames)
     if given is not None:
         GIVEN_POSES.save(context.folder, given)
-    told = {} if given is None else warn_of_given(context, structure, given, keyframes)
     panoramas = {"panoramas": rig.stations} if len(rig) > 1 else {}
-    return _figures(frames, structure, calibration) | told | panoramas | masked | places_figure(source, frames)
+    told |= places_figure(source, frames) | ({} if source.has_times else {"timed": False})
+    return _figures(frames, structure, calibration) | told | panoramas | masked
 
 
 def places_figure(source: Source, frames: list[Frame]) -> dict[str, str]:
@@ -139,7 +140,7 @@ def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks, rig: 
     while True:
         choice = choose_keyframes(pictures(), parallax / across)
         if not (context.config.frames.poses or parent_of(context.source)):
-            require_motion(choice.largest_displacement * across)
+            require_motion(choice.largest_displacement * across, choice.has_detail)
         if len(choice.keyframes) >= min(_FEW_KEYFRAMES, len(places)) or parallax < context.config.frames.parallax / 3:
             return choice
         parallax /= 2

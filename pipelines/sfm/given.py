@@ -29,18 +29,28 @@ _ROUNDS = 20
 _FAR_OFF = 5.0
 """Standard deviations from which a given pose is wrong altogether."""
 _MIN_SD = 1e-6
+_APART_DEGREES, _APART_SHARE = 3.0, 0.4
+"""Scatter of all given poses, in degrees and as a share of their path's extent, beyond which they are not those of the
+images. Of phones and of SLAM it is below 2 degrees; positions of other frames scatter by 0.6."""
 
 
 @dataclass(frozen=True)
 class Agreement:
     """Fit of given poses to found ones: given = `move`(found); standard deviations of the inliers, in the given unit
-    and in degrees; `wrong` (N,): outliers; `scale_sd`: relative."""
+    and in degrees; `wrong` (N,): outliers; `scale_sd`: relative; `extent`: root mean square distance of the given
+    positions from their middle."""
 
     move: Similarity
     position_sd: float
     degrees_sd: float
     wrong: NDArray[np.bool_]
     scale_sd: float
+    extent: float
+
+    @property
+    def is_contradiction(self) -> bool:
+        """Whether the two have so little in common that they cannot be poses of the same images."""
+        return self.degrees_sd > _APART_DEGREES or self.position_sd > _APART_SHARE * self.extent
 
 
 def agreement(found: Array, given: Array) -> Agreement | None:
@@ -68,7 +78,8 @@ def agreement(found: Array, given: Array) -> Agreement | None:
         weight = 1 / (1 + (away / sds[0] / 3) ** 2 + (turned / sds[1] / 3) ** 2)
     wrong = (away > _FAR_OFF * sds[0] + _MIN_SD) | (turned > _FAR_OFF * sds[1] + _MIN_SD)
     move = Similarity(scale, rotation, mean_b - scale * rotation @ mean_a)
-    return Agreement(move, sds[0], sds[1], wrong, sds[0] / max(scale * np.sqrt(spread), 1e-12))
+    relative_sd = sds[0] / max(scale * np.sqrt(spread), 1e-12)
+    return Agreement(move, sds[0], sds[1], wrong, relative_sd, scale * float(np.sqrt(spread / weight.sum())))
 
 
 def _turns(ours: Array, theirs: Array, rotation: Array) -> Array:

@@ -18,17 +18,24 @@ _TURN_ONLY_PX = 1.5
 _MIN_DISPLACEMENT_PX = 10.0
 _SAMPLED_PAIRS = 40
 _MAX_MATCH = 0.9
+_FEWEST_VIEWS = 3
 _COARSE_FOCALS = np.geomspace(0.4, 4.0, 13)
 _FINE_FACTORS = np.geomspace(0.85, 1.18, 9)
 
 
-def require_motion(largest_displacement: float) -> None:
-    """Raise InputError for a camera that does not move; displacement as a fraction of the image's longer side."""
+def require_motion(largest_displacement: float, has_detail: bool) -> None:
+    """Raise InputError for a camera that does not move, displacement as a fraction of the image's longer side, and for
+    images without detail."""
+    if not has_detail:
+        raise InputError(
+            "no image shows detail that could be followed into another one: they are dark, of plain surfaces, or out "
+            "of focus. Look at them; more light, or a view with furniture in it, gives detail"
+        )
     if largest_displacement < _MOVING_FRACTION:
         raise InputError(
             f"there is no parallax: over the whole source the image moves by at most {largest_displacement:.2%} of "
-            f"its longer side, so no depth can be found. Either the camera stands still, or the images are black or "
-            f"all the same: look at them. {HOW_TO_FILM}"
+            f"its longer side, so no depth can be found. Either the camera stands still, or the images are all the "
+            f"same: look at them. {HOW_TO_FILM}"
         )
 
 
@@ -54,6 +61,11 @@ def require_parallax(
 
 def why_no_structure(views: int, pairs: Sequence[VerifiedPair]) -> str:
     """Say what may be wrong where no model was found of so many views, and what the matching pairs rule out."""
+    if views < _FEWEST_VIEWS:
+        return (
+            f"{views} images are too few: one pair of them does not tell how the camera moved and what its focal "
+            f"length is. Take at least {_FEWEST_VIEWS - views} more of the same place, each a step further to the side"
+        )
     matched = len({view for pair in pairs for view in (pair.first, pair.second)})
     if matched < _MAX_MATCH * views:
         return (

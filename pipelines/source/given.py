@@ -1,6 +1,7 @@
 """Poses and calibration as the user gives them, and which pose belongs to which frame."""
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from .opening import Source, VideoSource, Warn
 _HOW = "give fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file that holds them"
 _MAX_NAMED = 8
 
+_MAX_STEP = 60
 MIN_POSES = 3
 """Poses that belong to an image, below which a file is taken for one of another recording."""
 
@@ -56,6 +58,25 @@ def given_poses(
     cam_from_world = np.full_like(found, np.nan)
     cam_from_world[known] = se3.inverse(found[known])
     return GivenPoses(cam_from_world, file.is_metric, file.kind)
+
+
+def numbering(config: FramesConfig, frames: Sequence[Frame], fits: Callable[[NDArray[np.float64]], bool]) -> str:
+    """Say under which other numbering the poses of `frames.poses` are those of the frames; "" where none is found.
+
+    Tried are the numbers, in the file's names or of its rows, as those of every n-th image counted from 0 or 1. `fits`
+    says whether (N, 4, 4) cam_from_world, NaN for a frame without, are the frames'.
+    """
+    from ..geometry import se3
+
+    file = read_poses(Path(config.poses))
+    row_of = {frame_number(Path(name.replace(".", "_"))): k for k, name in enumerate(file.names)}
+    row_of = row_of or {k: k for k in range(len(file))}
+    for first, step in itertools.product((1, 0), range(1, _MAX_STEP + 1)):
+        found = _rows(file, [row_of.get(round(f.source_index / step) + first) for f in frames])
+        if fits(se3.inverse(found)):
+            every = "image" if step == 1 else f"{step}th image" if step > 3 else {2: "2nd image", 3: "3rd image"}[step]
+            return f"every {every}, counted from {first}"
+    return ""
 
 
 def check_poses(config: FramesConfig, source: Source) -> None:

@@ -7,10 +7,8 @@ from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from ...formats.datasets import Sequence
-from ...formats.errors import InputError, install_command
+from ...formats.errors import InputError, install_extra
 from ...formats.image_folder import list_images, read_image_times, times_file, unread_images
 from ...formats.images import is_depth_map
 from ...formats.reading import file_sha256, files_sha256, opened, reaching, require_file
@@ -91,11 +89,9 @@ class FolderSource(ImageSource):
 
     def __init__(self, path: Path) -> None:
         images = _without_depth_maps(list_images(path))
-        times = read_image_times(images)
-        stamps = np.arange(len(images), dtype=np.float64) if times is None else times
         names = tuple(image.name for image in images)
         notes = _notes_on_unread(path)
-        super().__init__(Sequence("images", path, names, stamps, tuple(images), timed=times is not None, notes=notes))
+        super().__init__(Sequence("images", path, names, read_image_times(images), tuple(images), notes=notes))
 
     def _of_one_size(self, headers: Headers) -> Headers:
         headers = headers.of_most(lambda header: (min(header.stored), max(header.stored)))
@@ -187,7 +183,8 @@ def source_digest(source: Path, format: str) -> str:
     require_source(source)
     recording = open_recording(source, format)
     if recording is not None and recording.image_paths:
-        head = f"{recording.format} {recording.camera}".encode() + recording.timestamps.tobytes()
+        head = f"{recording.format} {recording.camera}".encode()
+        head += b"" if recording.timestamps is None else recording.timestamps.tobytes()
         return files_sha256(zip(recording.names, recording.image_paths, strict=True), head)
     if source.is_file():
         files = video_files(source)
@@ -229,7 +226,7 @@ def _warn_of_the_file(path: Path, reader: VideoReader, warn: Warn) -> None:
     if reader.tone_mapped:
         warn(f"{path.name} is HDR ({reader.hdr}): tone-mapped to the range of ordinary images")
     elif reader.hdr:
-        fix = install_command("msgs-slam[hdr]")
+        fix = install_extra("hdr")
         warn(f"{path.name} is HDR ({reader.hdr}), its colours will look flat. To read it in full: {fix}")
     _warn_of_the_rest(path, reader, warn)
     if reader.is_truncated:

@@ -53,15 +53,16 @@ def open_recording(path: Path, format: str) -> Sequence | None:
 class ImageSource:
     """Images of one size in the order of time: those of a sequence, whatever else that holds.
 
-    `has_times` says whether the timestamps are real; `headers` are those of the images that can be read.
+    `has_times` says whether the images have times, else those of `read` count them; `headers` are those of the images
+    that can be read.
     """
 
     def __init__(self, sequence: Sequence) -> None:
         """Read the headers. Raises InputError where they are not of one camera."""
         self.sequence = s = sequence
-        self.path, self.expected_frames, self.has_times = s.root, len(s), s.timed
+        self.path, self.expected_frames, self.has_times = s.root, len(s), s.timestamps is not None
         self._names = written_names(s.names, s.root)
-        self.headers, self._common = Headers({}, {}), None
+        self.headers, self._common = Headers({}), None
         if not s.image_paths:
             self.height, self.width = s.rgb(0).shape[:2]
             return
@@ -97,6 +98,7 @@ class ImageSource:
             self.headers.warn(warn)
             for note in self.sequence.notes:
                 warn(f"{self.sequence.format}: {note}")
+        times = self.sequence.timestamps
         for index in range(len(self.sequence)):
             if (wanted is not None and index not in wanted) or self.sequence.names[index] in self.headers.odd:
                 continue
@@ -107,7 +109,7 @@ class ImageSource:
                     warn(f"left out: {error}")
                 continue
             require_size(rgb, self.width, self.height, f"{self.sequence.names[index]} of {self.path}")
-            yield VideoFrame(index, float(self.sequence.timestamps[index]), rgb)
+            yield VideoFrame(index, float(index if times is None else times[index]), rgb)
 
     def name(self, frame_id: int, index: int) -> str:
         """The image's own name; formats that are not written here become .png."""
@@ -195,11 +197,10 @@ def written_names(names: Iterable[str], root: Path) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Headers:
-    """Headers of the images that can be read, by name, and why the others cannot; the sizes (width, height) of those
-    that are left out, as most are of another."""
+    """Headers of the images that can be read, by name; the sizes (width, height) of those that are left out, as most
+    are of another."""
 
     of: Mapping[str, Header]
-    unreadable: Mapping[str, str]
     odd: Mapping[str, Size] = field(default_factory=dict)
 
     def of_most(self, size: Callable[[Header], Size]) -> Headers:
@@ -277,17 +278,15 @@ def _first(names: Iterable[str]) -> str:
 def read_headers(folder: Path, images: Mapping[str, Path]) -> Headers:
     """Headers of these images of a folder. Raises InputError where none of them can be read."""
     found: dict[str, Header] = {}
-    unreadable: dict[str, str] = {}
+    reason = ""
     for name, path in images.items():
         try:
             found[name] = read_header(path)
         except InputError as error:
-            unreadable[name] = str(error)
+            reason = reason or str(error)
     if not found:
-        raise InputError(
-            f"none of the {len(images)} images of {folder} can be read: {next(iter(unreadable.values()), '')}"
-        )
-    return Headers(found, unreadable)
+        raise InputError(f"none of the {len(images)} images of {folder} can be read: {reason}")
+    return Headers(found)
 
 
 def common_span(headers: Headers, images: Mapping[str, Path]) -> tuple[float, float] | None:

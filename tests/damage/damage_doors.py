@@ -206,7 +206,7 @@ def data_set(format: str) -> Callable[[Path], None]:
         judge_camera(recording.camera)
         judge_camera(recording.depth_camera)
         judge_poses(recording.world_from_cam)
-        finite(recording.timestamps, "timestamps")
+        finite(() if recording.timestamps is None else recording.timestamps, "timestamps")
         need(0 < recording.depth_per_metre < math.inf, "depth scale")
         root = (path if path.is_dir() else path.parent).resolve()
         for file in (*recording.image_paths, *recording.depth_paths, *recording.label_paths):

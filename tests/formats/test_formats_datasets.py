@@ -58,7 +58,7 @@ def test_replica_camera_labels_and_times(shared_data: Path) -> None:
     sequence = open_sequence(shared_data / "replica_office0")
     assert sequence.camera == Camera(600, 340, 300.0, 300.0, 300.0, 170.0)
     assert sequence.rgb(5).shape == (340, 600, 3)
-    assert sequence.timestamps[[0, 1, 80]] == pytest.approx([0, 10 / 30, 800 / 30])
+    assert sequence.timestamps is None
     assert len(sequence.classes) == 101
     names = {c.id: c.name for c in sequence.classes}
     table = [line.split() for line in (shared_data / "replica_office0/classes_used.txt").read_text().splitlines()[1:]]
@@ -189,6 +189,15 @@ def test_generic_folder_with_tum_trajectory(tmp_path: Path) -> None:
     assert sequence.world_from_cam is not None
     assert sequence.has_pose.tolist() == [True, False, True]
     np.testing.assert_allclose(sequence.world_from_cam[[0, 2]], random_poses(3)[[1, 0]], atol=1e-8)
+    # Numbers in names are no times: poses of other instants would be assigned by them.
+    (tmp_path / "timestamps.txt").unlink()
+    sequence = open_sequence(tmp_path)
+    assert sequence.timestamps is None
+    np.testing.assert_allclose(sequence.world_from_cam, random_poses(3), atol=1e-8)
+    write_tum(tmp_path / "groundtruth.txt", np.arange(4) / 30, random_poses(4))
+    sequence = open_sequence(tmp_path)
+    assert sequence.world_from_cam is None
+    assert "the 4 poses of groundtruth.txt belong to times, and the 3 images state none" in sequence.notes[0]
 
 
 @pytest.mark.parametrize(

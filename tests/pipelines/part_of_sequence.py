@@ -12,4 +12,5 @@ def part_of(sequence: Sequence, indices: Iterable[int]) -> Sequence:
     paths = {n: tuple(getattr(sequence, n)[i] for i in keep) for n in ("image_paths", "depth_paths", "label_paths")}
     poses = None if sequence.world_from_cam is None else sequence.world_from_cam[keep]
     names = tuple(sequence.names[i] for i in keep)
-    return replace(sequence, names=names, timestamps=sequence.timestamps[keep], world_from_cam=poses, **paths)
+    times = None if sequence.timestamps is None else sequence.timestamps[keep]
+    return replace(sequence, names=names, timestamps=times, world_from_cam=poses, **paths)

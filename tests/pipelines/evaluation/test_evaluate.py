@@ -14,10 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.formats.trajectory import write_tum
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome, refined_pose, trajectory_cells
 from msgs_slam.pipelines.evaluation.mesh_error import mesh_cells
+from msgs_slam.pipelines.evaluation.report import _truth_section
 from msgs_slam.pipelines.evaluation.truth import match_truth, true_trajectory
-from msgs_slam.pipelines.evaluation.write import evaluation_table, write_evaluation
+from msgs_slam.pipelines.evaluation.write import evaluation_rows, evaluation_table, write_evaluation
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.mapping.move_map import rows_of
@@ -26,6 +29,7 @@ from msgs_slam.pipelines.render.api import render
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import WORLD, World
 from msgs_slam.pipelines.types import Frame
+from tests.matrices import write_matrices
 from tests.pipelines.part_of_sequence import part_of
 
 OracleRun = Callable[..., RunFolder]
@@ -75,6 +79,9 @@ def test_a_similarity_of_the_whole_run_changes_no_figure_but_the_scale(oracle_ru
     assert "missing" in moved["depth"]["metric_l1"]
     assert moved["depth"]["scale"] == pytest.approx(0.4, rel=0.01)
     assert moved["depth"]["scaled_l1"] == pytest.approx(plain["depth"]["scaled_l1"], rel=0.02)
+    of_views = [[v["depth_l1"] for v in result["views"] if v["depth_l1"] is not None] for result in (plain, moved)]
+    assert len(of_views[0]) == len(of_views[1]) >= 4
+    assert of_views[1] == pytest.approx(of_views[0], rel=0.05)
     for kind in ("keyframes", "between", "between at true poses"):
         assert moved["images"][kind]["psnr"] == pytest.approx(plain["images"][kind]["psnr"], abs=0.05)
     assert moved["labels"]["mean_iou"] == pytest.approx(plain["labels"]["mean_iou"], abs=0.005)
@@ -114,6 +121,93 @@ def test_a_video_is_matched_by_time_and_a_shifted_clock_too(oracle_run: OracleRu
     assert "shifted" in matched.by
     between = [Frame(i, f"{i}.jpg", 0.1 * i + 0.05, i, 1.0) for i in range(8)]
     assert (match_truth(between, False, truth).image == -1).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "by"),
+    [("{:06d}.png", "file name"), ("f{:03d}.png", "frame number"), ("p-{:d}.png", "frame number, counted from 1")],
+)
+def test_a_truth_without_times_is_matched_by_what_its_names_say(
+    oracle_run: OracleRun, truth: Sequence, tmp_path: Path, name: str, by: str
+) -> None:
+    first = 1 if by.endswith("1") else 0
+    folder = _untimed_copy(truth, tmp_path, {i: name.format(i + first) for i in range(1, 32, 2)})
+    result = evaluate_outcome(load_outcome(oracle_run(video=True)), folder, max_views=1)
+    assert result["protocol"][0].startswith(f"Frames belong to the truth of the same {by};")
+    assert result["frames"]["with true pose"] == 16
+    assert result["trajectory"]["sim3 all"]["max"] < 1e-6
+
+
+def test_a_truth_without_times_that_nothing_assigns_is_refused(
+    oracle_run: OracleRun, truth: Sequence, tmp_path: Path
+) -> None:
+    run = load_outcome(oracle_run(video=True))
+    subsampled = _untimed_copy(truth, tmp_path / "a", {i: f"frame_{1 + i // 4:05d}.png" for i in range(0, 32, 4)})
+    with pytest.raises(InputError, match=r"its images have no times, and neither .* timestamps\.txt"):
+        evaluate_outcome(run, subsampled, max_views=1)
+    named = _untimed_copy(truth, tmp_path / "b", dict(enumerate("abcdefgh")))
+    with pytest.raises(InputError, match="its images have no times"):
+        evaluate_outcome(run, replace(named, names=tuple("abcdefgh")), max_views=1)
+
+
+def test_times_that_only_count_the_frames_match_nothing(
+    oracle_run: OracleRun, truth: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = load_outcome(oracle_run())
+    for record in run.records.values():
+        monkeypatch.setitem(record.figures, "timed", False)
+    renamed = replace(truth, names=tuple(f"shot {name}" for name in truth.names))
+    result = evaluate_outcome(run, renamed, max_views=1)
+    assert "frame number" in result["protocol"][0]
+    assert result["trajectory"]["sim3 all"]["max"] < 1e-6
+    with pytest.raises(InputError, match="images of the run have no times"):
+        evaluate_outcome(run, replace(truth, names=tuple("a" * n for n in range(1, 33))), max_views=1)
+
+
+def test_tum_lines_of_traj_txt_are_the_truth_between_the_images(
+    oracle_run: OracleRun, truth: Sequence, tmp_path: Path
+) -> None:
+    assert truth.timestamps is not None
+    assert truth.world_from_cam is not None
+    sparse = _untimed_copy(truth, tmp_path, {i: f"{i:06d}.png" for i in range(0, 32, 4)})
+    write_tum(tmp_path / "traj.txt", truth.timestamps, truth.world_from_cam)
+    (tmp_path / "timestamps.txt").write_text("".join(f"{t:.6f}\n" for t in truth.timestamps[::4]))
+    folder = open_sequence(sparse.root, "folder")
+    result = evaluate_outcome(load_outcome(oracle_run(video=True)), folder, max_views=1)
+    assert (result["frames"]["with true image"], result["frames"]["with true pose"]) == (8, 32)
+    assert result["trajectory"]["sim3 all"]["max"] < 1e-6
+
+
+def _untimed_copy(truth: Sequence, folder: Path, names: dict[int, str]) -> Sequence:
+    """The images of `truth` under other names, with their poses in traj.txt."""
+    folder.mkdir(exist_ok=True)
+    assert truth.world_from_cam is not None
+    for index, name in names.items():
+        write_rgb(folder / name if "." in name else folder / f"{name}.png", truth.rgb(index))
+    write_matrices(folder / "traj.txt", truth.world_from_cam[list(names)])
+    sequence = open_sequence(folder, "folder")
+    assert sequence.timestamps is None
+    return sequence
+
+
+def test_a_truth_of_free_unit_claims_no_metres(oracle_run: OracleRun, truth: Sequence) -> None:
+    assert truth.world_from_cam is not None
+    poses = truth.world_from_cam.copy()
+    poses[:, :3, 3] *= 0.13
+    free = replace(truth, world_from_cam=poses, metric=False)
+    result = write_evaluation(oracle_run(mesh=True), free, max_views=2)
+    assert result["unit"] == "units of the truth"
+    assert result["trajectory"]["sim3 all"]["scale"] == pytest.approx(0.13, rel=1e-6)
+    for group in (result["trajectory"]["se3 all"], result["scale"], result["mesh"]):
+        assert "no metric scale" in group["missing"]
+    rows = {row[0]: row for row in evaluation_rows(result)}
+    ate = rows["ATE Sim(3), all: rmse / mean / median / max"][1]
+    assert ate.endswith("units of the truth")
+    assert rows["RPE rmse"][1].split(",")[0].endswith("units of the truth")
+    assert rows["metres per unit"][1] == rows["mesh"][1] == "–"
+    # The run's world and the true depth are metric, whatever the poses of the truth.
+    assert 0.001 < result["depth"]["metric_l1"] < 0.1
+    assert "units of the truth" in _truth_section(result, RunFolder(Path("nowhere")))
 
 
 def test_every_image_of_the_source_is_judged_beside_the_picked_frames(oracle_run: OracleRun, truth: Sequence) -> None:

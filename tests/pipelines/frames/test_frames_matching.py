@@ -334,6 +334,8 @@ def test_keyframes_go_on_behind_a_blank_stretch() -> None:
 def test_what_matches_rule_out_is_not_blamed() -> None:
     pairs = [VerifiedPair(i, i + 1, np.zeros((9, 2), np.uint32), 2, np.zeros((3, 3, 3))) for i in range(9)]
     assert "10 views match others, which rules out blur and plain surfaces. Possible" in why_no_structure(10, pairs)
+    assert "2 images are too few" in why_no_structure(2, pairs[:1])
+    assert "at least 1 more" in why_no_structure(2, pairs[:1])
     few = why_no_structure(10, pairs[:2])
     assert "pairs that match: 2. 7 views match no other. Possible causes: too little overlap" in few
     assert "fisheye" not in few

@@ -1,5 +1,6 @@
 """Poses by another program carry a path over what the pictures do not show, and make metres."""
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_rgb
+from msgs_slam.formats.trajectory import OPENCV_FROM_OPENGL
+from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
 from msgs_slam.pipelines.read_config import load_config
@@ -22,7 +25,7 @@ from msgs_slam.pipelines.tracking.segments import carry_given, drop_inconsistent
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import GivenPoses
 from tests.matrices import write_matrices
-from tests.pipelines.frames.conftest import FOCAL, HEIGHT, QUICK, WIDTH, render, sideways
+from tests.pipelines.frames.conftest import FOCAL, HEIGHT, QUICK, WIDTH, render, sideways, turn
 
 FRAMES, BLANK = 18, range(7, 11)
 SETTINGS = (
@@ -86,6 +89,23 @@ def test_pictures_that_show_nothing_stand_where_the_poses_say(tmp_path: Path) ->
     with pytest.raises(InputError, match="no parallax"):
         reconstruct(tmp_path / "pictures", RunFolder(tmp_path / "alone"), load_config(overrides=[*SETTINGS]),
                     SilentProgress(), "frames")  # fmt: skip
+
+
+def test_poses_under_another_numbering_are_refused_and_the_numbering_is_named(tmp_path: Path) -> None:
+    """A program that extracts every second frame of a video numbers them from 1."""
+    path = [(center, turn(-0.6 * t, 0.08 * np.cos(2 * t) - 0.25))
+            for t, (center, _) in zip(np.linspace(-1, 1, FRAMES), sideways(FRAMES), strict=True)]  # fmt: skip
+    video = write_video(tmp_path / "walk.avi", (render(*pose) for pose in path), 5, "MJPG")
+    table = []
+    for i, (center, rotation) in enumerate(path[::2], 1):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, center
+        matrix = (pose @ OPENCV_FROM_OPENGL).tolist()
+        table.append({"file_path": f"images/frame_{i:05d}.png", "transform_matrix": matrix})
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": table}))
+    config = load_config(overrides=[*SETTINGS, "frames.rate=0", f'frames.poses="{tmp_path / "transforms.json"}"'])
+    with pytest.raises(InputError, match=r"contradict the images.*every 2nd image, counted from 1, they agree"):
+        reconstruct(video, RunFolder(tmp_path / "run"), config, SilentProgress(), "frames")
 
 
 def walked(count: int) -> NDArray[np.float64]:
