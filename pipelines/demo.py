@@ -12,7 +12,7 @@ from ..formats.datasets import open_sequence
 from ..formats.errors import InputError
 from ..formats.images import write_rgb
 from ..formats.video import VideoReader
-from .evaluation.write import evaluation_table, write_evaluation
+from .evaluation.write import write_evaluation
 from .networks.check import KnownView
 from .run.folder import RunFolder
 from .system.progress import Progress
@@ -28,13 +28,10 @@ _KNOWN_FRAME = 18
 
 @dataclass(frozen=True)
 class DemoResult:
-    """Files of a demo, the figures of `evaluate_outcome` and their table in Markdown."""
+    """The run of a demo and the figures of `evaluate_outcome`."""
 
-    video: Path
-    truth: Path
     run: RunFolder
     figures: dict[str, Any]
-    table: str
 
 
 def unpack_demo_clip(folder: Path, clip: Path = CLIP) -> tuple[Path, Path]:
@@ -78,7 +75,7 @@ def run_demo(
     run = RunFolder(folder / RUN)
     reconstruct(video, run)
     figures = write_evaluation(run, open_sequence(truth), progress)
-    return DemoResult(video, truth, run, figures, evaluation_table(figures))
+    return DemoResult(run, figures)
 
 
 def demo_summary(result: DemoResult) -> list[str]:

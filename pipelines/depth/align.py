@@ -48,11 +48,10 @@ _ROUNDS = 5
 
 @dataclass(frozen=True)
 class WorldScale:
-    """The factor that makes the world metric, its relative standard deviation and the keyframes it comes from."""
+    """The factor that makes the world metric, and its relative standard deviation."""
 
     factor: float
     relative_sd: float
-    keyframes: int
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,7 @@ def world_scale(log_scales: Array) -> WorldScale:
     rest = used - mean
     correlation = float(rest[1:] @ rest[:-1] / max(float(rest @ rest), 1e-12)) if n > 2 else 0.0
     independent = max(n * (1 - correlation) / (1 + correlation), 1.0) if correlation > 0 else n
-    return WorldScale(float(np.exp(-mean)), float(used.std() / np.sqrt(max(independent, 1.0))), n)
+    return WorldScale(float(np.exp(-mean)), float(used.std() / np.sqrt(max(independent, 1.0))))
 
 
 def fit_to_points(field: NDArray[np.int64], basis: Basis, log_ratio: Array, weights: Array, middles: Array) -> Array:

@@ -64,7 +64,6 @@ class Volume:
     """
 
     voxel: float
-    truncation: float
     blocks: NDArray[np.int32]
     distance: NDArray[np.float32]
     weight: NDArray[np.float32]
@@ -156,7 +155,7 @@ def fuse(grid: Grid, chunks: NDArray[np.int32], views: Iterable[PosedDepth]) -> 
 
     for view in views:
         integrate(view)
-    return Volume(voxel, truncation, blocks, distance, weight)
+    return Volume(voxel, blocks, distance, weight)
 
 
 @kernel

@@ -13,14 +13,14 @@ class Constants:
     # (2), (3): reliability of the proxy depth
     alpha: float = 0.7
     beta: float = 0.8
-    """An exponent here: as a factor, which is printed, no pixel would pass tau_high."""
+    """An exponent here: as a factor, which is printed, hardly a pixel would pass tau_low."""
     gamma: float = 0.5
     steepness: float = 10.0
     """λ of (3), printed without a value."""
     phi: float = 0.5
     """φ of (3), printed without a value."""
-    tau_high: float = 0.85
     tau_low: float = 0.35
+    """The other threshold, τ_high = 0.85, is in no equation: pixels between the two count as those above it."""
 
     # (7): weight of an occluder
     kappa: float = 0.0

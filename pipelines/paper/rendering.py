@@ -23,34 +23,9 @@ def projection(
     return torch.stack([u, v], 1), radius, depth
 
 
-def blend_color(color: Tensor, f: Tensor) -> Tensor:
-    """Eq. (6): C = Σ c_i f_i Π_{j<i} (1 - f_j) of N Gaussians, near to far: color (N, 3), f (N,)."""
-    return (_weights(f, f)[:, None] * color).sum(0)
-
-
-def blend_depth(depth: Tensor, f: Tensor, proxy: Tensor, kappa: float) -> Tensor:
-    """Eq. (7): D = Σ d_i f_i Π_{j<i} (1 - f_j w_d(d_j, D̂)) with w_d of `occluder_weight`: depth, f (N,)."""
-    return (_weights(f, f * occluder_weight(depth, proxy, kappa)) * depth).sum(0)
-
-
-def blend_semantics(semantics: Tensor, f: Tensor) -> Tensor:
-    """Eq. (8): S = Σ s_i f_i Π_{j<i} (1 - f_j) of semantic vectors (N, K)."""
-    return (_weights(f, f)[:, None] * semantics).sum(0)
-
-
-def blend_silhouette(f: Tensor) -> Tensor:
-    """Eq. (9): Sil = Σ f_i Π_{j<i} (1 - f_j)."""
-    return _weights(f, f).sum(0)
-
-
 def occluder_weight(depth: Tensor, proxy: Tensor, kappa: float) -> Tensor:
     """w_d(d, D̂) = exp(-κ|d - D̂|²) of Eq. (7): an occluder that disagrees with the proxy hides less; 1 without one."""
     return torch.where(proxy > 0, torch.exp(-kappa * (depth - proxy).square()), torch.ones_like(depth))
-
-
-def _weights(f: Tensor, hidden: Tensor) -> Tensor:
-    before = torch.cat([torch.ones_like(f[:1]), torch.cumprod(1 - hidden, 0)[:-1]])
-    return f * before
 
 
 def draw(

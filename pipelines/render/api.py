@@ -1,6 +1,6 @@
 """Drawing a map from a camera: projection (MSGS-SLAM eq. 5) around the compositing of eq. (6)-(9)."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -65,40 +65,6 @@ def render(
     image = composite(u, v, sigma_px, z, opacities, features, *size, backend, near, notes)
     depth = depth_ratio(image.depth_sum, image.depth_silhouette)
     return Rendering(image.features, depth, image.silhouette)
-
-
-def pose_gradient(
-    means: Tensor,
-    radii: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    cam_from_world: Tensor,
-    intrinsics: Intrinsics,
-    loss_of: Callable[[Rendering], Tensor],
-    twist: Tensor | None = None,
-) -> tuple[float, Tensor]:
-    """Return a loss of what a camera sees of a map, and its gradient by the camera's pose exp(twist) @ cam_from_world.
-
-    Args:
-        means: (M, 3); radii, opacities: (M,); features: (M, C), all as in `render`.
-        cam_from_world: (4, 4) float64 pose.
-        intrinsics: the camera.
-        loss_of: a scalar of the `Rendering`: of its features, depth and silhouette.
-        twist: (6,) translation first; 0 where None.
-
-    Returns:
-        The loss, and its gradient (6,) float64 by the twist.
-    """
-    start = torch.zeros(6) if twist is None else twist.detach()
-    by = start.double().clone().requires_grad_()
-    means, radii, opacities, features = (x.detach() for x in (means, radii, opacities, features))
-    rows = in_view(means, radii, moved(cam_from_world, by).detach(), intrinsics)
-    with torch.enable_grad():
-        seen = render(
-            means[rows], radii[rows], opacities[rows], features[rows], cam_from_world.detach(), intrinsics, by
-        )
-        loss = loss_of(seen)
-    return float(loss.detach()), torch.autograd.grad(loss, by)[0]
 
 
 def kernels_for(backend: str | None, example: Tensor) -> ModuleType | None:

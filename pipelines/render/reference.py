@@ -168,7 +168,8 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
         weights, features = ctx.saved_tensors
-        pairs, gradient = ctx.pairs, gradients[0].contiguous()
+        pairs: Pairs = ctx.pairs
+        gradient = gradients[0].contiguous()
         size = (len(gradient), len(features))
         pattern = _sparse_rows(pairs.pixel_ends, pairs.gaussian, torch.zeros_like(weights), size)
         d_weights = torch.sparse.sampled_addmm(pattern, gradient, features.t(), beta=0.0).values()

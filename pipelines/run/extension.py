@@ -22,7 +22,7 @@ from ...formats.textfile import read_json_object, write_json
 from ..config import SOURCE_LIST
 from ..types import Calibration, Frame
 from .files import BACKBONE, CALIBRATION, EXPOSURE, FRAMES, MAP, TRAJECTORY
-from .folder import RunFolder, load_source
+from .folder import RunFolder
 from .schema import RunFile, dataclass_from_json, reading
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class ParentRun:
 
     @cached_property
     def contents(self) -> Mapping[str, Any]:
-        """{"source": digest, "camera", "files": name → sha256}."""
+        """{"camera", "files": name → sha256}."""
         return read_json_object(self.folder / CONTENTS)
 
     def _read(self, file: RunFile[T]) -> T:
@@ -69,11 +69,6 @@ class ParentRun:
         """Calibration of the undistorted frames."""
         with reading(self.folder / CONTENTS, "table of an extended run"):
             return dataclass_from_json(Calibration, self.contents["camera"])
-
-    @property
-    def source_digest(self) -> str:
-        """Digest of what the run was made from."""
-        return str(self.contents["source"])
 
     def poses_of(self, frames: Sequence[Frame]) -> NDArray[np.float64]:
         """cam_from_world (F, 4, 4) of these frames, NaN of those that were not there or had no place."""
@@ -130,5 +125,4 @@ def save_parent(run: RunFolder, folder: Path) -> None:
     for name in (MAP.name, EXPOSURE.name):
         copy_file(run.file(FINAL, name), folder / name)
     files = {file.name: file_sha256(folder / file.name) for file in (POSES, MAP, EXPOSURE)}
-    source, camera = load_source(run).digest, asdict(run.load(CALIBRATION))
-    write_json(folder / CONTENTS, {"source": source, "camera": camera, "files": files})
+    write_json(folder / CONTENTS, {"camera": asdict(run.load(CALIBRATION)), "files": files})

@@ -103,7 +103,6 @@ class Adjusted:
     bundle: Bundle
     initial_cost: float
     cost: float
-    iterations: int
 
 
 def adjust_bundle(
@@ -122,9 +121,8 @@ def adjust_bundle(
     problem = Problem(bundle, intrinsics, width, ids, rig)
     motions, points = bundle.cam_from_world.copy(), bundle.points.copy()
     cost = initial = problem.cost(motions, points)
-    damping, done = 1e-4, 0
-    while done < iterations:
-        done += 1
+    damping = 1e-4
+    for _ in range(iterations):
         normal = problem.linearise(motions, points)
         accepted = False
         while damping < 1e8:
@@ -142,7 +140,7 @@ def adjust_bundle(
         damping = max(damping / 5, 1e-8)
         if gain < _MIN_GAIN:
             break
-    return Adjusted(replace(bundle, cam_from_world=motions, points=points), initial, cost, done)
+    return Adjusted(replace(bundle, cam_from_world=motions, points=points), initial, cost)
 
 
 class Problem:

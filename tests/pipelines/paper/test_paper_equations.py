@@ -137,6 +137,31 @@ def test_5_projection_by_hand() -> None:
     assert depth.tolist() == [2.0]
 
 
+def _weights(f: Tensor, hidden: Tensor) -> Tensor:
+    before = torch.cat([torch.ones_like(f[:1]), torch.cumprod(1 - hidden, 0)[:-1]])
+    return f * before
+
+
+def blend_color(color: Tensor, f: Tensor) -> Tensor:
+    """Eq. (6): C = Σ c_i f_i Π_{j<i} (1 - f_j) of N Gaussians, near to far: color (N, 3), f (N,)."""
+    return (_weights(f, f)[:, None] * color).sum(0)
+
+
+def blend_depth(depth: Tensor, f: Tensor, proxy: Tensor, kappa: float) -> Tensor:
+    """Eq. (7): D = Σ d_i f_i Π_{j<i} (1 - f_j w_d(d_j, D̂)) with w_d of `occluder_weight`: depth, f (N,)."""
+    return (_weights(f, f * rendering.occluder_weight(depth, proxy, kappa)) * depth).sum(0)
+
+
+def blend_semantics(semantics: Tensor, f: Tensor) -> Tensor:
+    """Eq. (8): S = Σ s_i f_i Π_{j<i} (1 - f_j) of semantic vectors (N, K)."""
+    return (_weights(f, f)[:, None] * semantics).sum(0)
+
+
+def blend_silhouette(f: Tensor) -> Tensor:
+    """Eq. (9): Sil = Σ f_i Π_{j<i} (1 - f_j)."""
+    return _weights(f, f).sum(0)
+
+
 def stack() -> tuple[Tensor, Tensor]:
     """f and d of three Gaussians of one pixel, near to far."""
     return torch.tensor([0.5, 0.25, 0.8], dtype=torch.float64), torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)
@@ -146,23 +171,23 @@ def test_6_8_and_9_blend_front_to_back() -> None:
     f, _ = stack()
     weights = torch.tensor([0.5, 0.5 * 0.25, 0.5 * 0.75 * 0.8], dtype=torch.float64)
     colors, classes = torch.rand(3, 3, dtype=torch.float64), torch.rand(3, 5, dtype=torch.float64)
-    assert torch.allclose(rendering.blend_color(colors, f), weights @ colors)
-    assert torch.allclose(rendering.blend_semantics(classes, f), weights @ classes)
-    assert torch.allclose(rendering.blend_silhouette(f), weights.sum())
-    assert torch.allclose(rendering.blend_silhouette(f), 1 - torch.prod(1 - f))
+    assert torch.allclose(blend_color(colors, f), weights @ colors)
+    assert torch.allclose(blend_semantics(classes, f), weights @ classes)
+    assert torch.allclose(blend_silhouette(f), weights.sum())
+    assert torch.allclose(blend_silhouette(f), 1 - torch.prod(1 - f))
 
 
 def test_7_an_occluder_that_disagrees_with_the_proxy_hides_less() -> None:
     f, d = stack()
     proxy = torch.tensor(4.0, dtype=torch.float64)
-    ordinary = rendering.blend_color(d[:, None], f)[0]
-    assert torch.allclose(rendering.blend_depth(d, f, proxy, 0.0), ordinary)
+    ordinary = blend_color(d[:, None], f)[0]
+    assert torch.allclose(blend_depth(d, f, proxy, 0.0), ordinary)
     hidden = [0.5 * math.exp(-9.0), 0.25 * math.exp(-4.0)]
     expected = 0.5 + 2 * 0.25 * (1 - hidden[0]) + 4 * 0.8 * (1 - hidden[0]) * (1 - hidden[1])
-    assert float(rendering.blend_depth(d, f, proxy, 1.0)) == pytest.approx(expected)
-    assert torch.allclose(rendering.blend_depth(d, f, torch.zeros(()).double(), 1.0), ordinary)
+    assert float(blend_depth(d, f, proxy, 1.0)) == pytest.approx(expected)
+    assert torch.allclose(blend_depth(d, f, torch.zeros(()).double(), 1.0), ordinary)
     assert torch.autograd.gradcheck(
-        lambda a, b: rendering.blend_depth(a, b, proxy, 0.7), (d.requires_grad_(), f.requires_grad_())
+        lambda a, b: blend_depth(a, b, proxy, 0.7), (d.requires_grad_(), f.requires_grad_())
     )
 
 
@@ -176,17 +201,17 @@ def test_the_renderer_draws_these_equations() -> None:
     order = torch.argsort(depth)
     pixel = torch.tensor([20.5, 15.5])
     f = torch.stack([rendering.density(pixel, xy[i], radius[i], opacities[i]) for i in order])
-    assert torch.allclose(shown.features[15, 20, :3], rendering.blend_color(features[order, :3], f), atol=1e-5)
-    assert torch.allclose(shown.features[15, 20, 3:], rendering.blend_semantics(features[order, 3:], f), atol=1e-5)
-    assert torch.allclose(shown.silhouette[15, 20], rendering.blend_silhouette(f), atol=1e-5)
+    assert torch.allclose(shown.features[15, 20, :3], blend_color(features[order, :3], f), atol=1e-5)
+    assert torch.allclose(shown.features[15, 20, 3:], blend_semantics(features[order, 3:], f), atol=1e-5)
+    assert torch.allclose(shown.silhouette[15, 20], blend_silhouette(f), atol=1e-5)
     proxy = torch.full((36, 48), 2.2)
     for kappa in (0.0, 3.0):
         drawn = rendering.weighted_depth(means, radii, opacities, pose, CAMERA, proxy, kappa)
-        above, below = (rendering.blend_depth(d, f, proxy[0, 0], 0.0) for d in (depth[order], torch.ones(6)))
+        above, below = (blend_depth(d, f, proxy[0, 0], 0.0) for d in (depth[order], torch.ones(6)))
         if kappa:
             weights = torch.cumprod(1 - f * rendering.occluder_weight(depth[order], proxy[0, 0], kappa), 0)
             below = (f * torch.cat([torch.ones(1), weights[:-1]])).sum()
-            above = rendering.blend_depth(depth[order], f, proxy[0, 0], kappa)
+            above = blend_depth(depth[order], f, proxy[0, 0], kappa)
         assert torch.allclose(drawn[15, 20], above / below, atol=1e-5)
     ordinary = rendering.weighted_depth(means, radii, opacities, pose, CAMERA, proxy, 0.0)
     assert torch.allclose(ordinary, shown.depth, atol=1e-4)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.render.api import Rendering, composite, moved, pose_gradient, project_map, render
+from msgs_slam.pipelines.render.api import Rendering, composite, moved, project_map, render
 from msgs_slam.pipelines.types import Intrinsics
 
 
@@ -215,10 +215,11 @@ def test_pose_gradient_equals_finite_differences():
         return loss(render(*tensors, pose, scene.intrinsics, twist=twist, backend="reference"))
 
     twist = torch.tensor([0.01, 0.0, -0.01, 0.0, 0.01, 0.02], dtype=torch.float64)
-    value, gradient = pose_gradient(*tensors, pose, scene.intrinsics, loss, twist)
+    value = loss_at(twist.requires_grad_())
+    (gradient,) = torch.autograd.grad(value, twist)
+    twist = twist.detach()
     steps = 1e-7 * torch.eye(6, dtype=torch.float64)
     numeric = torch.stack([(loss_at(twist + step) - loss_at(twist - step)) / 2e-7 for step in steps])
-    assert value == pytest.approx(float(loss_at(twist)))
     assert gradient.norm() > 1
     torch.testing.assert_close(gradient, numeric, rtol=1e-4, atol=1e-4 * float(gradient.norm()))
 
