@@ -1,5 +1,6 @@
 """The one error a user is meant to read, and the commands that it names."""
 
+import importlib.metadata
 import importlib.util
 import shlex
 import sys
@@ -24,6 +25,19 @@ class RecoverableError(InputError):
 
 class DiskFullError(RecoverableError):
     """The disk is full."""
+
+
+def install_extra(extra: str) -> str:
+    """Return the shell command that installs the packages of an extra of this program.
+
+    They are named one by one, since an index of packages may have another program under this one's name.
+    """
+    try:
+        declared = importlib.metadata.requires("msgs-slam") or []
+    except importlib.metadata.PackageNotFoundError:  # run from its sources
+        return install_command(f".[{extra}]")
+    needed = (text.partition(";") for text in declared)
+    return install_command(*(name.strip() for name, _, marker in needed if f'"{extra}"' in marker.replace("'", '"')))
 
 
 def install_command(*requirements: str) -> str:

@@ -333,7 +333,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
 
 
 def _quiet_open(file: IO[bytes], name: str) -> Image.Image:
-    from pillow_heif import register_heif_opener  # takes as long to import as all the rest of a command that opens none
+    from pi_heif import register_heif_opener  # takes as long to import as all the rest of a command that opens none
 
     register_heif_opener()
     with warnings.catch_warnings():

@@ -22,6 +22,7 @@ _LABEL_ATTRIBUTE = "_LABEL"
 _PLACE, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 _VERTEX = np.dtype([*((n, "<f4") for n in _PLACE), *((n, "u1") for n in (*_COLOR, "label"))])
 _FACE = np.dtype([("vertex_indices", "<i4", (3,))])
+_LISTED = {"vertex": _VERTEX, "face": np.dtype([("length", "u1"), *_FACE.descr])}
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +90,7 @@ def _face_rows(faces: NDArray[np.int32], count: int) -> NDArray[Any]:
 
 def mesh_blocks(path: Path) -> MeshBlocks:
     """Return the mesh of a PLY by `write_mesh_ply`. Raises InputError for another file."""
-    listed = np.dtype([("length", "u1"), *_FACE.descr])
-    vertex, face = read_rows(path, {"vertex": _VERTEX, "face": listed}).values()
+    vertex, face = read_rows(path, _LISTED).values()
 
     def vertices() -> Iterator[tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]]:
         for rows in vertex.blocks:
@@ -106,13 +106,7 @@ def read_mesh_ply(path: Path) -> MeshArrays:
     Vertices without colours are grey, without labels 255. Raises InputError for a file that is no mesh.
     """
     path = Path(path)
-    ply = read_ply(path)
-    if "vertex" not in ply or "face" not in ply:
-        raise InputError(f"{path} has no faces: it is a point cloud or a splat file, not a mesh")
-    vertex, face = ply["vertex"].data, ply["face"].data
-    indices = next((n for n in ("vertex_indices", "vertex_index") if n in (face.dtype.names or ())), None)
-    if indices is None:
-        raise InputError(f"{path}: its faces have no vertex_indices: it is no mesh this program can read")
+    vertex, faces = _own_tables(path) or _tables(path)
     names = vertex.dtype.names or ()
     count = len(vertex)
     has_colors = {"red", "green", "blue"} <= set(names)
@@ -121,9 +115,29 @@ def read_mesh_ply(path: Path) -> MeshArrays:
     labels = columns(vertex, ["label"], path)[:, 0].clip(0, 255) if "label" in names else np.full(count, 255)
     with parsing(path, "mesh", "export it again"):
         return MeshArrays(
-            columns(vertex, ["x", "y", "z"], path), _triangles(face[indices], count), colors.astype(np.uint8),
+            columns(vertex, ["x", "y", "z"], path), _triangles(faces, count), colors.astype(np.uint8),
             labels.astype(np.uint8),
         )  # fmt: skip
+
+
+def _own_tables(path: Path) -> tuple[NDArray[Any], NDArray[Any]] | None:
+    """Vertices and corners of faces of a PLY by `write_mesh_ply`; None for any other."""
+    try:
+        tables = [np.concatenate([np.zeros(0, r.dtype), *r.blocks]) for r in read_rows(path, _LISTED).values()]
+    except InputError:
+        return None
+    return tables[0], tables[1]["vertex_indices"]
+
+
+def _tables(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
+    ply = read_ply(path)
+    if "vertex" not in ply or "face" not in ply:
+        raise InputError(f"{path} has no faces: it is a point cloud or a splat file, not a mesh")
+    face = ply["face"].data
+    indices = next((n for n in ("vertex_indices", "vertex_index") if n in (face.dtype.names or ())), None)
+    if indices is None:
+        raise InputError(f"{path}: its faces have no vertex_indices: it is no mesh this program can read")
+    return ply["vertex"].data, face[indices]
 
 
 def write_mesh_glb(

@@ -6,16 +6,18 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElementParseError
 
 from .atomic import atomic_path
 from .errors import InputError
 from .gaussians import GaussianCloud, parts_of, unit_quaternions
 from .reading import opened, parsing
+
+if TYPE_CHECKING:
+    from plyfile import PlyData  # under the GPL: imported for PLY files of other programs only
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * f_dc."""
@@ -46,7 +48,7 @@ _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int
 }
 
 
-def read_ply(path: Path) -> PlyData:
+def read_ply(path: Path) -> "PlyData":
     """Read a PLY file by plyfile. Raises InputError when it is missing, a git-LFS pointer, no PLY, or cut short."""
     with opened(path) as file:
         head = file.read(_MAX_HEADER_BYTES)
@@ -57,8 +59,10 @@ def read_ply(path: Path) -> PlyData:
         return _parsed(path)
 
 
-def _parsed(path: Path) -> PlyData:
+def _parsed(path: Path) -> "PlyData":
     """By mapping where all rows have the same length: plyfile's other way takes 20 s for half a million rows."""
+    from plyfile import PlyData, PlyElementParseError
+
     try:
         return PlyData.read(str(path), mmap="c", known_list_len={"face": {"vertex_indices": 3, "vertex_index": 3}})
     except PlyElementParseError:
@@ -283,7 +287,7 @@ def read_gaussian_ply(path: Path) -> GaussianCloud:
         return _cloud(ply, path)
 
 
-def _cloud(ply: PlyData, path: Path) -> GaussianCloud:
+def _cloud(ply: "PlyData", path: Path) -> GaussianCloud:
     vertex = ply["vertex"].data
     names = vertex.dtype.names or ()
     return GaussianCloud(

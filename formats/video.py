@@ -21,7 +21,7 @@ os.environ.setdefault("OPENCV_VIDEOIO_DEBUG", "0")
 
 import cv2
 
-from .errors import InputError, install_command
+from .errors import InputError, install_extra
 from .images import IMAGE_SUFFIXES
 from .reading import opened, require_unicode
 from .video_clock import Clock, longest_step
@@ -288,7 +288,7 @@ def _undecodable(path: Path, codec: str = "") -> InputError:
     file = shlex.quote(str(path))
     if codec and codec.lower() not in _DECODED:
         name = _CODECS.get(codec.lower(), codec)
-        more = "" if has_pyav() else f"; `{install_command('msgs-slam[hdr]')}` brings more decoders"
+        more = "" if has_pyav() else f"; `{install_extra('hdr')}` brings more decoders"
         return InputError(
             f"no image can be decoded from {path}: there is no decoder for its codec, {name}, "
             f"or it is damaged: convert it with `ffmpeg -i {file} -c:v libx264 OUT.mp4`{more}"

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .colours import RGB_FROM_2020, srgb_of
-from .errors import InputError, install_command
+from .errors import InputError, install_extra
 from .video_head import TRANSFERS
 
 # The containers of one video each. Left out is what names other files (playlists, scripts, numbered images) or is made
@@ -264,7 +264,7 @@ def unreadable(path: Path, codec: str, first: int = 0) -> InputError:
         )
     return InputError(
         f"{path} is interlaced video (as from camcorders and television), which OpenCV does not decode: install PyAV "
-        f"with `{install_command('msgs-slam[hdr]')}`, or convert it with `ffmpeg -i {file} -vf yadif OUT.mp4`"
+        f"with `{install_extra('hdr')}`, or convert it with `ffmpeg -i {file} -vf yadif OUT.mp4`"
     )
 
 

@@ -137,11 +137,11 @@ def render(
     source: Path, target: Path, kind: str, camera_path: str, fps: float | None, size: tuple[int, int] | None,
     output: Output,
 ) -> None:  # fmt: skip
-    """Draw the map of RUN along a camera path, or any splat FILE (.ply, .spz, .glb, .splat) along an orbit or a
+    """Render the map of RUN along a camera path, or any splat FILE (.ply, .spz, .glb, .splat) along an orbit or a
     recorded path, into a video or a folder of images.
 
-    An .mp4 is H.264 where PyAV is installed (pip install 'msgs-slam[hdr]'), else VP9: browsers play both. An .avi or
-    .mkv loses nothing (FFV1).
+    An .mp4 is H.264 where PyAV is installed (the extra [hdr]), else VP9: browsers play both. .avi and
+    .mkv are lossless (FFV1).
     """
     is_file = source.is_file() and source.suffix.lower() in SPLAT_FILES
     if is_file and (kind != "color" or camera_path == "own"):
@@ -163,11 +163,11 @@ def render(
 @click.option("--port", default=8080, type=click.IntRange(1, 65535), show_default=True, help="Where to serve.")
 @click.option("--host", default="127.0.0.1", show_default=True, help="Which address to serve on.")
 def view(path: Path, port: int, host: str) -> None:
-    """Look at a run, or at any Gaussians (.ply, .spz, .glb, .splat), in the browser.
+    """View a run, or any splat file (.ply, .spz, .glb, .splat), in the browser.
 
     A run that is not finished shows what its stages have made by now, and more as soon as another one ends.
 
-    Needs the extra: pip install 'msgs-slam[viewer]'.
+    Needs the extra [viewer]: pip install '.[viewer]' in the checkout.
     """
     if path.is_dir():
         open_run(path)

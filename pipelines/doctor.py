@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..formats.errors import install_command
+from ..formats.errors import install_command, install_extra
 from .system.device import unused_card
 from .system.memory import available_cpus
 from .system.wording import BAD, GOOD, NOTE, Finding
@@ -74,7 +74,7 @@ def _requirements() -> Finding:
             lacking.append(f"{r.name}{r.specifier}")
     if wrong:
         return Finding("requirements", BAD, "; ".join(wrong), install_command(*lacking))
-    return Finding("requirements", GOOD, "every package is there in a version that fits")
+    return Finding("requirements", GOOD, "all packages present, versions compatible")
 
 
 def _libraries() -> Finding:
@@ -91,7 +91,7 @@ def _libraries() -> Finding:
         )
     import torch
 
-    return Finding("libraries", GOOD, f"all load; torch {torch.__version__}")
+    return Finding("libraries", GOOD, f"all libraries load; torch {torch.__version__}")
 
 
 def _video() -> Finding:
@@ -106,12 +106,12 @@ def _video() -> Finding:
     if read != len(frames):
         fix = install_command("--force-reinstall", "opencv-python-headless")
         return Finding("video", BAD, f"{read} of {len(frames)} frames came back from an MP4", fix)
-    return Finding("video", GOOD, "MP4 is written and read")
+    return Finding("video", GOOD, "MP4 read and write work")
 
 
 def _viewer() -> Finding:
     if importlib.util.find_spec("viser") is None:
-        return Finding("viewer", NOTE, "`msgs-slam view` is not installed", install_command(f"{DISTRIBUTION}[viewer]"))
+        return Finding("viewer", NOTE, "`msgs-slam view` is not installed", install_extra("viewer"))
     return Finding("viewer", GOOD, f"viser {importlib.metadata.version('viser')}")
 
 

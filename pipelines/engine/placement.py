@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Protocol, TypeVar
 
-from ...formats.errors import InputError, RecoverableError, install_command
+from ...formats.errors import InputError, RecoverableError, install_extra
 from ..system.progress import SIGNALS, Progress, Stopped, is_asked, log, stop_if_asked
 from ..system.wording import quoted
 from .tasks import TaskBoard, code_identity, require_same_world
@@ -251,7 +251,7 @@ class RayCluster:
                 return CommandResult(command, str(error.cause))
             return CommandResult(command, (  # `run_on_node` could not begin
                 f"on the node {error.ip}, which has no msgs-slam, or another version: {str(error.cause)[-300:]}\n"
-                "Install the same msgs-slam[cluster] on every node, in the Python that `ray start` runs in"
+                "Install the same version, with the extra [cluster], on every node, in the Python of `ray start`"
             ))  # fmt: skip
         except self._ray.exceptions.LocalRayletDiedError as error:
             raise RecoverableError(f"Ray on this machine ({platform.node()}) has ended. {_GO_ON}") from error
@@ -344,7 +344,7 @@ def _import_ray() -> Any:
     try:
         import ray
     except ImportError as error:
-        fix = install_command("msgs-slam[cluster]")
+        fix = install_extra("cluster")
         raise InputError(f"--engine ray needs Ray on every node: {fix}") from error
     return ray
 

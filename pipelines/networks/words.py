@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.errors import InputError, install_command
+from ...formats.errors import InputError, install_extra
 from ...formats.reading import parsing, require_file
 from ...formats.tensors import load_arrays
 from .card import Card
@@ -137,7 +137,7 @@ def open_tokenizer(path: Path) -> Any:
         from tokenizers import Tokenizer
     except ImportError as error:
         raise InputError(
-            f"a text encoder needs a package that is not here: {install_command('msgs-slam[words]')}. Or give the card "
+            f"a text encoder needs a package that is not here: {install_extra('words')}. Or give the card "
             'a table of embeddings: text = "words.npz"'
         ) from error
     require_file(path, _MAX_TOKENIZER_BYTES)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from ...formats.errors import InputError, install_command
+from ...formats.errors import InputError, install_extra
 from ...formats.images import write_rgb
 from ...formats.splats import read_gaussians
 from ...formats.video_writer import CODECS, PLAYED, write_browser_video, write_video
@@ -197,7 +197,7 @@ def _write(target: Path, pictures: Iterator[Picture], fps: float) -> Path:
     if (codec := write_browser_video(target, pictures, fps)) not in PLAYED:
         log.warning(
             "%s is %s, which browsers do not play: nothing here writes H.264 or VP9. %s",
-            target, codec, install_command("msgs-slam[hdr]"),
+            target, codec, install_extra("hdr"),
         )  # fmt: skip
     return target
 

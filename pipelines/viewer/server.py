@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ...formats.errors import InputError, install_command
+from ...formats.errors import InputError, install_extra
 from ..export.extra.floor_plan import walls_of_run
 from ..source.sharpness import at_most_wide
 from .flight import Flight
@@ -53,7 +53,7 @@ def open_viewer(path: Path, host: str = "127.0.0.1", port: int = 8080) -> Viewer
     try:
         import viser
     except ImportError as error:
-        raise InputError(f"the viewer needs viser: {install_command('msgs-slam[viewer]')}") from error
+        raise InputError(f"the viewer needs viser: {install_extra('viewer')}") from error
     try:
         with guard_server(host):
             server = viser.ViserServer(

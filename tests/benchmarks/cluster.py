@@ -6,7 +6,7 @@
     python tests/benchmarks/cluster.py --work DIR --nodes 1 --bad folder          a node that is of no use, then resume
 
 Every node is a process of this machine with one CPU; the head has none, so that tasks run on the others. A killed node
-is replaced at once. Needs msgs-slam[cluster].
+is replaced at once. Needs the extra [cluster].
 """
 
 # ruff: noqa: E402 (the packages are found only once the path is set)

@@ -195,7 +195,7 @@ def test_wrong_settings_are_refused_before_anything(recordings: Path, tmp_path: 
     assert run_batch(recordings, tmp_path / "runs", "--address", "x:1").exit_code == 2
 
 
-@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra msgs-slam[cluster]")
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra [cluster]")
 def test_ray_places_a_process_for_each_recording(
     recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

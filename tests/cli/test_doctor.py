@@ -11,7 +11,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from msgs_slam.formats.errors import install_command
+from msgs_slam.formats.errors import install_command, install_extra
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines import doctor
 from msgs_slam.pipelines.doctor import BAD, GOOD, NOTE, Finding, examine
@@ -54,13 +54,15 @@ def test_commands_install_beside_this_program(has_pip: bool, words: str, monkeyp
     """Whatever environment the shell is in; `uv tool` makes some without pip."""
     monkeypatch.setattr(sys, "executable", "/opt/my tools/bin/python")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if has_pip else None)
-    command = install_command("msgs-slam[viewer]", "torch<3")
+    command = install_command(".[viewer]", "torch<3")
     assert words in command
     split = shlex.split(command)
     assert "/opt/my tools/bin/python" in split
-    assert split[-2:] == ["msgs-slam[viewer]", "torch<3"]
+    assert split[-2:] == [".[viewer]", "torch<3"]
     viewer = found("viewer", Path("."))
-    assert viewer.fix in ("", install_command("msgs-slam[viewer]"))
+    assert viewer.fix in ("", install_extra("viewer"))
+    assert shlex.split(install_extra("hdr"))[-1] == "av>=14"
+    assert "msgs-slam" not in install_extra("cluster")
 
 
 def test_a_check_that_breaks_is_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

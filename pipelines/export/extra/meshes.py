@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from ....formats.atomic import atomic_path, require_room
-from ....formats.errors import InputError, install_command
+from ....formats.errors import InputError, install_extra
 from ....formats.glb import Part, linear, material, write_primitive
 from ....formats.mesh import MeshArrays, read_mesh_ply
 from ...outcome import Outcome
@@ -82,9 +82,7 @@ def write_usd(outcome: Outcome, world: World, folder: Path) -> list[Path]:
     try:
         import pxr  # noqa: F401
     except ImportError as error:
-        raise InputError(
-            f"USD needs the package usd-core, which is not installed: {install_command('msgs-slam[usd]')}"
-        ) from error
+        raise InputError(f"USD needs the package usd-core, which is not installed: {install_extra('usd')}") from error
     mesh = mesh_of_run(outcome, world)
     per_unit = 1.0 if outcome.metric or world.earth or outcome.metres is None else outcome.metres.per_unit
     write_usdz(folder / USD, mesh, outcome.classes.names, world.gltf_from_exported, per_unit)

@@ -9,7 +9,7 @@ import torch
 ON_CARD = torch.cuda.is_available()
 if not ON_CARD:
     os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported and again when the kernels are
-pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip install 'msgs-slam[cuda-check]'")
+pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip install '.[cuda-check]'")
 
 from msgs_slam.pipelines.compute.adam import descend_by_kernel, plain_descend  # noqa: E402
 from tests.card_builds import build  # noqa: E402

@@ -25,7 +25,7 @@ from msgs_slam.pipelines.engine.tasks import Shard, boards_in
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import Stopped, soft_stop
 
-needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra msgs-slam[cluster]")
+needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra [cluster]")
 
 
 @pytest.fixture(scope="module", params=["local", pytest.param("ray", marks=needs_ray)])

@@ -75,7 +75,7 @@ def test_pictures_are_scaled_as_the_network_was_trained() -> None:
 
 def test_why_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "lpips", None)
-    assert "msgs-slam[lpips]" in str(open_lpips())
+    assert "pip install 'lpips>=" in str(open_lpips())
     assert "models pull --from" in str(open_lpips())
 
 

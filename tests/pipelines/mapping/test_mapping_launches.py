@@ -8,7 +8,7 @@ import torch
 if torch.cuda.is_available():
     pytest.skip("the count needs kernels that are interpreted", allow_module_level=True)
 os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported and again when the kernels are
-pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip install 'msgs-slam[cuda-check]'")
+pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip install '.[cuda-check]'")
 
 from tests.benchmarks.launches import VIEWS, measure
 

@@ -11,7 +11,7 @@ import torch
 ON_CARD = torch.cuda.is_available()
 if not ON_CARD:
     os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported and again when the kernels are
-pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip install 'msgs-slam[cuda-check]'")
+pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip install '.[cuda-check]'")
 
 from test_proxy_stereo import CAMERAS, MATRIX, scene, view_of_plane  # noqa: E402
 
