@@ -17,7 +17,7 @@ demo:
 		{ echo "No NVIDIA driver: PyTorch for the CPU."; $(VENV)/bin/python $(PIP) --retries 1 $(CPU_TORCH); } || \
 		echo "download.pytorch.org cannot be reached: the PyTorch of PyPI, with CUDA."
 	$(VENV)/bin/python $(PIP) '.[viewer]'
-	$(VENV)/bin/msgs-slam models pull --yes || echo "The demo goes on without networks: few names, less certain metres."
+	$(VENV)/bin/msgs-slam models pull --yes || echo "Continuing without networks: fewer class names, less certain scale."
 	$(VENV)/bin/msgs-slam demo
 
 test: lint wheel

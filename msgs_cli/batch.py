@@ -32,9 +32,11 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("folder", type=FOLDER)
-@click.option("--out", "-o", type=FOLDER, required=True, metavar="RUNS", help="Of the runs, batch.json and batch.md.")
+@click.option(
+    "--out", "-o", type=FOLDER, required=True, metavar="RUNS", help="Folder for the runs, batch.json and batch.md."
+)
 @engine_options("local: one recording after the other; ray: as many at once as the cluster has room for.")
-@click.option("--shard", default="0/1", metavar="K/N", help="Every N-th recording only, the K-th from 0 on.")
+@click.option("--shard", default="0/1", metavar="K/N", help="Process recordings K, K+N, K+2N, ... only (K from 0).")
 @click.option("--placed", nargs=2, hidden=True, help="Reconstruct NAME from SOURCE in this process: of a placement.")
 @click.option("--threads", type=int, default=0, hidden=True, help="Where the settings leave them open.")
 @settings_options
@@ -144,9 +146,9 @@ def work(run_path: Path, shard: str, placed: bool, until: str, output: Output) -
     """Process RUN together with other workers, on this machine or others that see the folder.
 
     Begin the run with `msgs-slam reconstruct SOURCE --out RUN --until frames`, with all settings, run.threads among
-    them. Then any number of processes, in any order and at any time, bring it to its end together, each its own share
-    of the tasks first; one alone would do all. What a killed one was at is done by the others. For SLURM arrays,
-    Kubernetes indexed jobs and AWS Batch: docs/batch.md.
+    them. Then any number of processes, in any order and at any time, finish it together; each starts with its own share
+    of the tasks. A single process is enough, and the others take over the tasks of one that is killed. For SLURM
+    arrays, Kubernetes indexed jobs and AWS Batch: docs/batch.md.
     """
     from ..pipelines.engine.placement import stop_with_parent
     from ..pipelines.engine.tasks import Shard

@@ -134,7 +134,7 @@ def main() -> None:
     msgs-slam demo                      try it on a small synthetic room (about 4 minutes on two cores)
     msgs-slam reconstruct video.mp4     the whole job; writes video.msgs/
     msgs-slam resume video.msgs         resume an interrupted run
-    msgs-slam extend RUN more.mp4       add a video to a finished run; its map is kept and grown
+    msgs-slam extend RUN more.mp4       extend a finished run with another video; its map is kept
     msgs-slam batch FOLDER --out RUNS   many recordings, on one machine or many
     msgs-slam work RUN --shard K/N      one of many processes at one long run
     msgs-slam status video.msgs         what is done, what was found
@@ -173,11 +173,11 @@ def reconstruct(
     output: Output,
     **given: str | int | None,
 ) -> None:
-    """Reconstruct SOURCE, a video, a folder of images or a data set, into a run folder; of several videos by one camera
-    of one place, one run.
+    """Reconstruct SOURCE, a video, a folder of images or a data set, into a run folder; several videos of one place
+    from one camera become one run.
 
-    No option is needed. Stopped at any moment, the same command, or `msgs-slam resume RUN`, goes on where it was; with
-    a changed setting only the stages that depend on it run again.
+    No option is needed. If interrupted, run the same command, or `msgs-slam resume RUN`, to continue; with a changed
+    setting only the stages that depend on it run again.
     """
     from ..pipelines.reconstruct import default_run_folder, existing_config, one_source
     from ..pipelines.reconstruct import reconstruct as run_reconstruct
@@ -217,7 +217,7 @@ def resume(
     **given: str | int | None,
 ) -> None:
     """Resume RUN where it stopped. Finished stages are kept unless one of their settings is changed, or --redo names
-    them. A stage that is made again replaces what it had left only when it ends well."""
+    them. A stage that is run again replaces its old output only if it succeeds."""
     if redo and STAGES.index(redo) > STAGES.index(until):
         raise click.UsageError(f"--redo {redo} comes after --until {until}: nothing would be made again")
     from ..pipelines.reconstruct import require_run
@@ -346,7 +346,7 @@ def demo(
 @main.command()
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 def completion(shell: str) -> None:
-    """Print what makes a shell complete commands and options: msgs-slam completion bash >> ~/.bashrc."""
+    """Print a shell completion script: msgs-slam completion bash >> ~/.bashrc."""
     from click.shell_completion import get_completion_class
 
     found = get_completion_class(shell)

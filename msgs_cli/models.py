@@ -21,6 +21,10 @@ def models() -> None:
     """List, download and check the learned models for depth and classes. A reconstruction never downloads."""
 
 
+_WIDTH = 100
+"""Characters of a line where the output goes into a file or pipe."""
+
+
 def _size(model: Model) -> str:
     return f"{model.bytes / 1e6:.1f} MB" if model.bytes else "size unknown"
 
@@ -33,19 +37,19 @@ def list_models() -> None:
     store, rows = ModelStore.open(), []
     for model in store.models:
         here = store.is_here(model)
-        notes = ["commercial use allowed" if model.commercial else "ask before commercial use"]
+        notes = [] if model.commercial else ["ask before commercial use"]
         if model.pull:
-            notes.append("comes with `models pull`" if model.pull == "default" else "comes with `models pull --best`")
+            notes.append("`models pull`" if model.pull == "default" else "`models pull --best`")
         if not model.sha256:
-            notes.append("hash unknown: pull with --trust")
+            notes.append("hash unknown: --trust")
         elif model.urls and not model.revision:
-            notes.append("no fixed revision: refused if its makers replace it")
+            notes.append("no fixed revision")
         family = store.families[model.family]
         use = "metres" if family.get("metres_only") else family["task"]
         if here or model.urls:  # of the others there is nothing to pull
-            about = f"{model.licence} ({'; '.join(notes)})"
+            about = "; ".join([model.licence, *notes])
             rows.append((model.name, use, "here" if here else "-", _size(model), about))
-    click.echo(format_table(("model", "for", "", "size", "licence"), rows, terminal_width()))
+    click.echo(format_table(("model", "for", "", "size", "licence"), rows, terminal_width() or _WIDTH))
     click.echo(f"cache: {store.cache}")
 
 
@@ -56,19 +60,19 @@ def list_models() -> None:
     "--from",
     "folder",
     type=click.Path(path_type=Path),
-    help="Take the files from this folder, under whatever names, instead of the network.",
+    help="Take the files from this folder, under any file names, instead of the network.",
 )
 @click.option(
     "--trust",
     is_flag=True,
-    help="Accept a model whose sha256 nobody has published (DINOv2's head), and keep the hash of what comes.",
+    help="Accept a model without a published sha256 (DINOv2's head), and remember the hash of the downloaded file.",
 )
 @click.option("--offline", is_flag=True, help="Only check what is here; download nothing.")
 @click.option("--yes", is_flag=True, help="Do not ask about the licences.")
 def pull(names: tuple[str, ...], best: bool, folder: Path | None, trust: bool, offline: bool, yes: bool) -> None:
     """Download models by name, with what they need; without a name the small ones (4 MB): classes, metres, people.
 
-    A broken download goes on where it stopped.
+    Interrupted downloads resume.
     """
     from ..formats.errors import InputError
     from ..pipelines.networks.registry import ModelStore
@@ -98,13 +102,21 @@ def pull(names: tuple[str, ...], best: bool, folder: Path | None, trust: bool, o
 def _pull_one(store: ModelStore, model: Model, trust: bool, offline: bool) -> Path:
     from tqdm import tqdm
 
-    with tqdm(total=model.bytes, unit="B", unit_scale=True, desc=model.name, leave=False) as bar:
+    bars: list[tqdm] = []  # none before something arrives: an error stands on a line of its own
 
-        def show(done: int, size: int) -> None:
-            bar.n = done
-            bar.refresh()
+    def show(done: int, size: int) -> None:
+        if not bars:
+            bars.append(tqdm(total=model.bytes, unit="B", unit_scale=True, desc=model.name, leave=False))
+        bars[0].n = done
+        bars[0].refresh()
+        if done == size:
+            bars[0].close()
 
+    try:
         return store.pull(model, show, trust, offline)
+    finally:
+        for bar in bars:
+            bar.close()
 
 
 @models.command()

@@ -145,7 +145,7 @@ class FramesConfig:
         option=Option(
             "poses", "FILE|FOLDER",
             "Camera poses by another program to start from: a COLMAP model, a transforms.json, ARKit's JSON, a TUM "
-            "trajectory or lines of 4x4 matrices. They need not be exact, nor all there.",
+            "trajectory or lines of 4x4 matrices. They may be inexact or incomplete.",
         ),
     )  # fmt: skip
     rolling_shutter: str = setting(
@@ -326,7 +326,7 @@ class ExportConfig:
         paths=("",),
         option=Option(
             "gps", "FILE",
-            "Where it was taken, for files with x east, y north in metres: a GPX track, or a CSV with the columns "
+            "Location, to georeference the export (x east, y north, metres): a GPX track, or a CSV with the columns "
             "time, lat, lon, alt (a video counts from its start). Default: auto, the images' EXIF; off for neither.",
         ),
     )  # fmt: skip

@@ -102,17 +102,11 @@ class RunStatus:
     @property
     def notes(self) -> list[str]:
         """Remarks on the run that are no fault."""
-        return [
-            f"{s.name} keeps what auto chose when it was made ({', '.join(s.newer)}); "
-            + (
-                f"networks installed since then: {', '.join(s.networks)}. To use them: "
-                f"`msgs-slam resume {quoted(self.run.root)} --redo {s.name}`"
-                if s.networks
-                else "the networks that it used are not installed any more"
-            )
-            for s in self.stages
-            if s.newer
-        ]
+        new = {s.name: s.networks for s in self.stages if s.newer and s.networks}
+        seconds = {s.name: s.record.seconds for s in self.stages if s.record}
+        gone = [f"{s.name} ({', '.join(s.newer)})" for s in self.stages if s.newer and not s.networks]
+        kept = f"networks that were used are not installed any more, their results are kept: {', '.join(gone)}"
+        return ([_about_networks(self.run, new, seconds)] if new else []) + ([kept] if gone else [])
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; the records without their lists of files."""
@@ -202,10 +196,13 @@ def about_new_networks(run: RunFolder, program: Program) -> str:
             newer = changed_auto_choices(stage, config, record, stage.inputs(source, config) if stage.inputs else None)
             if networks := networks_chosen(newer):
                 added[stage.name] = networks
-    if not added:
-        return ""
-    first = next(iter(added))
-    minutes = sum(r.seconds for name, r in records.items() if STAGES.index(name) >= STAGES.index(first)) / 60
+    return _about_networks(run, added, {name: r.seconds for name, r in records.items()}) if added else ""
+
+
+def _about_networks(run: RunFolder, added: dict[str, tuple[str, ...]], seconds: dict[str, float]) -> str:
+    """Name the networks that stages could use by now, and the command, with the minutes that these stages took."""
+    first = min(added, key=STAGES.index)
+    minutes = sum(taken for name, taken in seconds.items() if STAGES.index(name) >= STAGES.index(first)) / 60
     return (
         f"Networks installed since this run: {', '.join(dict.fromkeys(n for v in added.values() for n in v))}. To use "
         f"them: msgs-slam resume {quoted(run.root)} --redo {first} (it took {minutes:.0f} min without them)"

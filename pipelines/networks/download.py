@@ -51,7 +51,7 @@ def fetch(urls: Sequence[str], target: Path, size: int, sha256: str, progress: C
     for path in (target, part, _tag_file(part)):
         if path.is_dir():
             raise InputError(f"{path} is a folder where a file should be: remove it, or choose another cache folder")
-    reasons = []
+    reasons: list[str] = []
     for url in urls:
         if not _is_safe(url):
             raise InputError(f"{url}: only https addresses are downloaded from")
@@ -63,14 +63,15 @@ def fetch(urls: Sequence[str], target: Path, size: int, sha256: str, progress: C
         if not reason:
             os.replace(part, target)
             _discard(part)
+            if reasons:
+                log.warning("%s came from %s: %s", target.name, url, "; ".join(reasons))
             return actual
-        log.warning("%s: %s", url, reason)
         reasons.append(f"{url}: {reason}")
     raise InputError(
-        "download failed from every address:\n  "
+        f"{target.name} could not be downloaded from any address:\n  "
         + "\n  ".join(reasons)
-        + "\nCheck the network and try again, or bring the "
-        "file from elsewhere: msgs-slam models pull --from FOLDER"
+        + "\nCheck the network and try again, or download the file elsewhere into a folder, under any name, and then: "
+        "msgs-slam models pull --from FOLDER"
     )
 
 

@@ -92,9 +92,9 @@ def find_metres(
     if metres is not None and seen is not None and not given and not is_room(seen, usual):
         metres = replace(metres, only_in_room=True)
         warning = (
-            "no label network tells what the images show, and no ceiling is in them: the estimated size holds if the "
-            "scene is a room; outdoors it may be wrong by ten times. `msgs-slam models pull` brings a label network; "
-            "--scale-ref or --gps give the size itself"
+            "the scale assumes an indoor room (no label network, no ceiling in view); outdoors it may be off by a "
+            "factor of ten. Install a label network with `msgs-slam models pull`, or give the scale with --scale-ref "
+            "or --gps"
         )
     return metres, warning
 

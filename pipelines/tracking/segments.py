@@ -157,9 +157,9 @@ def carry_given(context: StageContext, state: TrackState, apart: Iterable[Sequen
             _detach(state, group)
             continue
         context.warn(
-            f"{len(group)} frames ({stretches(group)}) and the rest are each consistent, but what the camera shows in "
-            "between hardly determines how they lie relative to each other: expect a bend or another scale there. Film "
-            "what lies between again, with more than a bare wall in view"
+            f"{len(group)} frames ({stretches(group)}) are consistent with each other, but almost nothing connects "
+            "them to the rest: their relative position and scale are unreliable. Film the transition again, with more "
+            "than a bare wall in view"
         )
     if given is None:
         return {}

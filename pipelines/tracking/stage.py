@@ -81,9 +81,9 @@ def warn_of_stretches(context: StageContext, frames: list[Frame], unplaced: Coll
     for run in np.split(ids, np.flatnonzero(np.diff(ids) > MAX_GAP) + 1):
         if len(run) and times[run[-1]] - times[run[0]] >= _LONG:
             context.warn(
-                f"from {times[run[0]]:.1f} to {times[run[-1]]:.1f} s (frames {run[0]}-{run[-1]}) hardly a frame has a "
-                "position: the camera stood, only turned, or showed too little, such as a bare wall. Film that part "
-                "again while walking, with something textured in view"
+                f"from {times[run[0]]:.1f} to {times[run[-1]]:.1f} s (frames {run[0]}-{run[-1]}) almost no frame "
+                "could be located: the camera stood still, only turned, or saw too little, such as a bare wall. Film "
+                "that part again while walking, with something textured in view"
             )
 
 

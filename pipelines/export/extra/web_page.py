@@ -108,6 +108,7 @@ def _cameras(outcome: Outcome, upright: NDArray[np.float64]) -> dict[str, Any]:
         "path": np.round(centers[rows], 4).tolist(),
         "cameras": [
             {
+                "n": int(t.frame_ids[row]),
                 "p": np.round(centers[row], 6).tolist(),
                 "r": np.round(t.cam_from_world[row][:3, :3] @ upright.T, 7).ravel().tolist(),
                 "t": round(float(t.timestamps[row]), 3),

@@ -74,6 +74,7 @@ def test_nothing_is_fetched_and_the_map_is_whole(page: tuple[Path, Outcome]) -> 
     classes = np.bincount(rest[:, 4], minlength=len(outcome.classes))[: len(outcome.classes)] / len(m)
     np.testing.assert_allclose([c["share"] for c in about["classes"]], classes, atol=1e-5)
     assert len(text) < 20 * len(m) + 60_000
+    assert [camera["n"] for camera in about["cameras"]] == outcome.trajectory.frame_ids.tolist()
 
 
 def test_names_cannot_become_a_part_of_the_page(oracle_run: OracleRun, tmp_path: Path) -> None:
@@ -112,7 +113,7 @@ def test_a_browser_draws_what_we_draw(page: tuple[Path, Outcome], tmp_path: Path
     path, outcome = page
     cameras = json.loads(part(path.read_text(encoding="utf-8"), "about"))["cameras"]
     number = round(share * (len(cameras) - 1))
-    shot = read_rgb(screenshot(f"{path.as_uri()}#camera={number}&bare", tmp_path))
+    shot = read_rgb(screenshot(f"{path.as_uri()}#camera={cameras[number]['n']}&bare", tmp_path))
     t, k = outcome.trajectory, outcome.calibration.intrinsics
     row = int(np.argmin(np.linalg.norm(t.centers - cameras[number]["p"], axis=1)))
     (width, height), focal = SIZE, min(SIZE[0] * k.fx / k.width, SIZE[1] * k.fy / k.height)

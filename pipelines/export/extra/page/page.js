@@ -1,5 +1,5 @@
-// The page: buttons, pointers, keys, what is drawn over the map. #camera=N in the address looks as the N-th camera does,
-// &mode=classes in the colours of the classes, &bare shows nothing but the map.
+// The page: buttons, pointers, keys, what is drawn over the map. #camera=N in the address looks as the camera of
+// frame N does, or the nearest one, &mode=classes in the colours of the classes, &bare shows nothing but the map.
 
 const find = (id) => document.getElementById(id);
 const about = JSON.parse(find("about").textContent);
@@ -27,8 +27,9 @@ async function start() {
   find("facts").textContent = `${shown} Gaussians. ${metres}`;
   addEventListener("resize", again);
   reset();
-  const camera = about.cameras[+wanted.get("camera")];
-  if (wanted.has("camera") && camera) eye.take(camera, about.depth);
+  const off = (camera) => Math.abs(camera.n - wanted.get("camera"));
+  const nearest = about.cameras.reduce((best, camera) => (best && off(best) <= off(camera) ? best : camera), null);
+  if (wanted.has("camera") && nearest) eye.take(nearest, about.depth);
   paint();
   document.documentElement.dataset.ready = "1";
 }
