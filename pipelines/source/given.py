@@ -69,6 +69,8 @@ def numbering(config: FramesConfig, frames: Sequence[Frame], fits: Callable[[NDA
     from ..geometry import se3
 
     file = read_poses(Path(config.poses))
+    if file.times is not None and not file.names:
+        return ""
     row_of = {frame_number(Path(name.replace(".", "_"))): k for k, name in enumerate(file.names)}
     row_of = row_of or {k: k for k in range(len(file))}
     for first, step in itertools.product((1, 0), range(1, _MAX_STEP + 1)):

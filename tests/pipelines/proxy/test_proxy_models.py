@@ -87,7 +87,7 @@ def test_a_line_cut_twice_is_continued_where_it_broke(server: tuple[str, Behavio
 def test_a_later_call_goes_on_and_a_changed_file_begins_again(server: tuple[str, Behaviour], tmp_path: Path) -> None:
     url, behaviour = server
     behaviour.cuts = [300_000, 0]
-    with pytest.raises(InputError, match="download failed"):
+    with pytest.raises(InputError, match="could not be downloaded"):
         fetch([f"{url}/m"], tmp_path / "m.onnx", len(DATA), SHA, silent)
     assert (tmp_path / "m.onnx.part").stat().st_size == 300_000
     behaviour.etag, behaviour.data = '"two"', DATA[::-1]
@@ -102,16 +102,24 @@ def test_without_ranges_it_begins_again(server: tuple[str, Behaviour], tmp_path:
     assert (tmp_path / "m.onnx").read_bytes() == DATA
 
 
-def test_404_and_a_wrong_hash_go_to_the_next_mirror(server: tuple[str, Behaviour], tmp_path: Path) -> None:
+def test_404_and_a_wrong_hash_go_to_the_next_mirror(
+    server: tuple[str, Behaviour], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     url, behaviour = server
     behaviour.missing = ("/gone",)
     fetch([f"{url}/gone", f"{url}/m"], tmp_path / "m.onnx", len(DATA), SHA, silent)
     assert [p for p, _ in behaviour.requests] == ["/gone", "/m"]
+    assert [r.getMessage().count("404") for r in caplog.records] == [1]
     with pytest.raises(InputError, match=r"sha256 is .* expected 0000"):
         fetch([f"{url}/m"], tmp_path / "n.onnx", len(DATA), "0" * 64, silent)
     assert not list(tmp_path.glob("n.onnx*"))
-    with pytest.raises(InputError, match="404"):
+    caplog.clear()
+    with pytest.raises(
+        InputError, match=r"^n\.onnx could not be downloaded from any address:\n  .*/gone: .*404"
+    ) as failed:
         fetch([f"{url}/gone"], tmp_path / "n.onnx", len(DATA), SHA, silent)
+    assert str(failed.value).count("/gone") == 1
+    assert not caplog.records, "the error names the address"
 
 
 def test_another_size_is_refused_before_it_is_written(server: tuple[str, Behaviour], tmp_path: Path) -> None:
