@@ -90,7 +90,7 @@ def test_this_machine_is_reached_from_itself_alone() -> None:
     ],
 )
 def test_answers_that_make_no_sense_are_reasons(serve: Serve, tmp_path: Path, answer: bytes) -> None:
-    assert "download failed" in refused([serve(answer)], tmp_path / "m")
+    assert "could not be downloaded" in refused([serve(answer)], tmp_path / "m")
 
 
 @pytest.mark.parametrize("head", [OK + b"Content-Length: 1000\r\n\r\n", b"HTTP/1.1 200 OK\r\nX: "])
@@ -101,7 +101,7 @@ def test_a_server_that_drips_is_left(
     monkeypatch.setattr(download, "_ANSWER_SECONDS", 0.2)
     monkeypatch.setattr(download, "_ATTEMPTS", 1)
     url = serve(head, *[b"x"] * 1000, pause=0.02)
-    assert "download failed" in refused([url], tmp_path / "m")
+    assert "could not be downloaded" in refused([url], tmp_path / "m")
 
 
 def test_a_strange_tag_and_folders_in_the_way(serve: Serve, tmp_path: Path) -> None:
