@@ -128,9 +128,8 @@ def match_by_time(times: NDArray[np.float64], sequence: Sequence) -> MatchedTrut
     """Match the instants (N,) in seconds, which may differ from the sequence's by a constant; `has_times` of it."""
     pose_times, true_poses = true_trajectory(sequence)
     image_times = np.zeros(0) if sequence.timestamps is None else sequence.timestamps
-    first, start = min((t[0] for t in (image_times, pose_times) if len(t)), default=0.0), 0.0
-    if first > times[-1] + 1:
-        start = float(first)
+    first = float(min((t[0] for t in (image_times, pose_times) if len(t)), default=0.0))
+    start = first if first > times[-1] + 1 else 0.0
     image = np.full(len(times), -1, np.int64)
     i, j = associate(times, image_times - start, _tolerance(image_times))
     image[i] = j
