@@ -39,7 +39,7 @@ def draw(
     proxy: Tensor | None = None,
     kappa: float = 0.0,
 ) -> Rendering:
-    """Draw Eqs. (6) to (9) for every pixel by the compiled renderer: features are colours (M, 3) beside semantics.
+    """Eqs. (6) to (9) for every pixel, by the compiled renderer: features are colours (M, 3) beside semantics.
 
     The depth is that of Eq. (7) over its own weights. With κ > 0 it comes from the renderer in plain torch, where
     proxy (H, W) says which occluders to believe.

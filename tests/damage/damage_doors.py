@@ -20,6 +20,7 @@ import torch
 from damage_mutate import Mutator, in_json, in_ply, in_text, in_zip, with_json_head
 from layouts import LAYOUTS
 from PIL import Image
+from pillow_heif import register_heif_opener
 from tiny_tflite import write_tflite
 from tokenizers import Tokenizer, normalizers, pre_tokenizers, trainers
 from tokenizers import models as tokenizer_models
@@ -319,6 +320,9 @@ def make_colmap(suffix: str) -> Callable[[Path], None]:
 def make_splat(folder: Path) -> None:
     rows = np.ones(10, dtype=[("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
     (folder / "a.splat").write_bytes(rows.tobytes())
+
+
+register_heif_opener()  # to write HEIC, which the program only reads
 
 
 def make_picture(name: str, **options: Any) -> Callable[[Path], None]:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageCms
 from PIL.TiffImagePlugin import IFDRational
-from pillow_heif import from_bytes
+from pillow_heif import from_bytes, register_heif_opener
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.exif import ExifLens, lens_of, place_of
@@ -34,6 +34,8 @@ from msgs_slam.formats.images import (
     write_rgb,
 )
 from msgs_slam.pipelines.source.opening import open_source
+
+register_heif_opener()  # to write HEIC, which the program only reads
 
 
 def _focal_px(path: Path, width: int, height: int) -> float | None:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from pillow_heif import register_heif_opener
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
@@ -15,6 +16,7 @@ from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.types import Frame
 from tests.formats.test_formats_images import P3_IN_XYZ, icc_profile
 
+register_heif_opener()  # to write HEIC, which the program only reads
 EQUIVALENT, FOCAL, ZOOM, PITCH = 0xA405, 0x920A, 0xA404, 0xA20E
 
 

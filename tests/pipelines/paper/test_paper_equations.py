@@ -43,14 +43,15 @@ def a_map(view: View, pose: Tensor | None = None) -> Gaussians:
 
 
 def named_by_equation() -> dict[int, set[str]]:
-    """module.function of all whose docstrings begin with an equation, or a term of one."""
+    """module.function of all whose docstrings begin with an equation, several, or a term of one."""
     found: dict[int, set[str]] = {}
     for path in Path(paper.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.FunctionDef):
                 text = ast.get_docstring(node) or ""
-                if match := re.match(r"(?:First term of |Second term of )?Eq\. \((\d+)\)", text):
-                    found.setdefault(int(match[1]), set()).add(f"{path.stem}.{node.name}")
+                if match := re.match(r"(?:First term of |Second term of )?Eqs?\. \((\d+)\)(?: to \((\d+)\))?", text):
+                    for number in range(int(match[1]), int(match[2] or match[1]) + 1):
+                        found.setdefault(number, set()).add(f"{path.stem}.{node.name}")
     return found
 
 
