@@ -17,15 +17,15 @@ COPYLEFT = {
 MENTIONS = {
     "backports-strenum": "the text of Python's licence says that it is compatible with the GPL",
     "llvmlite": "LLVM's licence says that it is compatible with the GPL",
-    "ml-dtypes": "Eigen is under the MPL-2.0; files under the LGPL are not compiled in",
+    "ml-dtypes": "the MPL-2.0, Eigen's licence, names it as a secondary one",
     "numba": "the text of Python's licence says that it is compatible with the GPL",
     "numpy": "libgfortran and libquadmath, with the GCC runtime exception and under the LGPL, linked dynamically",
-    "onnxruntime": "Eigen, as in ml-dtypes",
+    "onnxruntime": "the MPL-2.0, Eigen's licence, names it as a secondary one",
     "opencv-python-headless": "FFmpeg under the LGPL, linked dynamically",
-    "pillow": "FreeType and others under a choice of licences, of which one is not the GPL",
+    "pillow": "FreeType is under a choice of two licences, of which one is not the GPL",
     "scipy": "libgfortran and libquadmath, as in numpy",
-    "setuptools": "packages that it carries, under a choice of licences",
-    "torch": "headers under a choice of licences, of which one is not the GPL; the text of LLVM's",
+    "setuptools": "carries autocommand under the LGPL, for its own use",
+    "torch": "LLVM's licence names it; a test of a part of kineto, which is not in the package, is under it",
     "typing-extensions": "the text of Python's licence says that it is compatible with the GPL",
 }
 """Packages with a permissive licence whose files of licences mention the GPL, and why they may."""
@@ -84,6 +84,8 @@ def test_the_documentation_names_the_weights_and_the_gpl_that_come_along() -> No
     places = ("formats", "pipelines", "msgs_cli")
     weights = [p for room in places for p in (ROOT / room).rglob("*") if p.suffix in WEIGHTS and p.is_file()]
     assert [p.relative_to(ROOT).as_posix() for p in weights] == ["pipelines/depth/completion/weights.npz"]
+    installed = importlib.metadata.files(PROJECT["name"]) or []  # those of the wheel, where it is what is tested
+    assert {p.name for p in installed if p.suffix in WEIGHTS} <= {weights[0].name}
     for page in ("README.md", "docs/index.md"):
         text = " ".join((ROOT / page).read_text(encoding="utf-8").split())
         assert f"Licence: {PROJECT['license']}" in text
