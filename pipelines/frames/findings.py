@@ -159,8 +159,7 @@ def warn_of_given(
     if agreed is None:
         context.warn("the given poses cannot be compared with those found: too few, or they hardly move")
         return figures
-    if agreed.is_contradiction:
-        raise InputError(_other_poses(context, agreed, found, [frames[row] for row in rows]))
+    _require_same_images(context, structure, given, found, [frames[row] for row in rows], ids)
     wrong = [row for row, is_wrong in zip(rows, agreed.wrong, strict=True) if is_wrong]
     unit = " m" if given.is_metric else ""
     if wrong:
@@ -173,6 +172,27 @@ def warn_of_given(
         "given_degrees_sd": round(agreed.degrees_sd, 4),
         "given_wrong": wrong,
     }
+
+
+def _require_same_images(
+    context: StageContext,
+    structure: Structure,
+    given: GivenPoses,
+    found: NDArray[np.float64],
+    frames: list[Frame],
+    ids: list[int],
+) -> None:
+    """Raise InputError for given poses that the largest part of the structure contradicts; where images contradict the
+    structure too, warn of it. `frames` are those of keyframes `ids`, which have poses `found` (N, 4, 4)."""
+    inside = [n for n, k in enumerate(ids) if k in structure.report.largest]
+    frames, found = [frames[n] for n in inside], found[inside]
+    agreed = agreement(found, given.cam_from_world[[frame.id for frame in frames]])
+    if agreed is None or not agreed.is_contradiction:
+        return
+    complaint = _other_poses(context, agreed, found, frames)
+    if structure.report.is_consistent:
+        raise InputError(complaint)
+    context.warn(complaint)
 
 
 def _other_poses(context: StageContext, agreed: Agreement, found: NDArray[np.float64], frames: Sequence[Frame]) -> str:

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -9,9 +10,12 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets.sequence import Camera
+from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.config import FramesConfig
+from msgs_slam.pipelines.frames.findings import _require_same_images
 from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import GIVEN_POSES
 from msgs_slam.pipelines.sfm.candidates import GIVEN, _selection_score
 from msgs_slam.pipelines.sfm.consistency import ModelReport
@@ -51,6 +55,32 @@ def test_agreement_tells_scale_noise_and_what_is_absurd() -> None:
     assert found.position_sd * np.sqrt(3) == pytest.approx(0.05, rel=0.4)
     assert np.flatnonzero(known)[found.wrong].tolist() == [7]
     assert agreement(ours[:2], given[:2]) is None
+
+
+def test_only_poses_that_contradict_all_of_a_sound_structure_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text("".join(f"{i}.0 0 0 0 0 0 0 1\n" for i in range(20)))
+    found = walk_round(CAMERA, views=20).cam_from_world
+    warnings: list[str] = []
+    context = SimpleNamespace(config=load_config(overrides=[f'frames.poses="{tmp_path / "poses.txt"}"']),
+                              warn=warnings.append)  # fmt: skip
+
+    def judge(given: NDArray[np.float64], largest: range, is_consistent: bool = True) -> None:
+        report = SimpleNamespace(largest=tuple(largest), is_consistent=is_consistent)
+        frames = [Frame(i, f"{i}.jpg", float(i), i, 0.0) for i in range(20)]
+        structure, poses = SimpleNamespace(report=report), GivenPoses(given, False, "made up")
+        _require_same_images(context, structure, poses, found, frames, [*range(20)])  # type: ignore[arg-type]
+
+    given = disturbed(found)
+    judge(np.where(np.isfinite(given), given, found), range(20))
+    # A part that shares no point with the rest lies anywhere; the given poses will tell where.
+    apart = found.copy()
+    apart[11:] = apart[11:] @ se3.exp(np.array([9.0, -4.0, 3.0, 0.8, -1.1, 0.4]))
+    judge(apart, range(11))
+    other = found[np.random.default_rng(0).permutation(20)]
+    judge(other, range(20), is_consistent=False)
+    assert "contradict the images, by" in warnings[-1]
+    with pytest.raises(InputError, match="contradict the images, by"):
+        judge(other, range(20))
 
 
 @pytest.mark.parametrize("is_known", [True, False], ids=["known_camera", "unknown_camera"])
