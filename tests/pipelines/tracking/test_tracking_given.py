@@ -86,7 +86,7 @@ def test_pictures_that_show_nothing_stand_where_the_poses_say(tmp_path: Path) ->
     good = backbone.frame_ids != 3
     assert np.abs(placed - relative.T)[good].max() < 0.03
     assert any("), unchecked" in w for w in records["frames"].warnings)
-    with pytest.raises(InputError, match="no parallax"):
+    with pytest.raises(InputError, match="no image shows detail"):
         reconstruct(tmp_path / "pictures", RunFolder(tmp_path / "alone"), load_config(overrides=[*SETTINGS]),
                     SilentProgress(), "frames")  # fmt: skip
 
