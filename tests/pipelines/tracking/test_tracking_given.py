@@ -181,7 +181,7 @@ def test_a_group_that_lies_loosely_beside_the_rest_is_put_where_the_given_poses_
     context: Any = SimpleNamespace(run=SimpleNamespace(find=lambda _: given), warn=warned.append)
     figures = carry_given(context, state, [group])
     assert figures["given_joined"] == is_given
-    assert ("disconnected components" if is_given else "10 frames (10-19) and the rest") in warned[0]
+    assert ("disconnected components" if is_given else "10 frames (10-19) are consistent") in warned[0]
     off = np.abs([state.poses[i] - true[i] for i in range(40)]).max((1, 2))
     assert off[:10].max() == off[20:].max() == 0
     assert (off[group].max() < 1e-9) == is_given
