@@ -261,7 +261,7 @@ def _warn_of_the_rest(path: Path, reader: VideoReader, warn: Warn) -> None:
     named = [f"track {i} ({track.width}x{track.height})" for i, track in enumerate(reader.tracks, 1)]
     if others := [i for i in range(len(named)) if i != reader.track]:
         wanted = main if main in others else others[0]
-        more = "" if wanted != main else f"; `{install_extra("hdr")}` makes it the one that is read"
+        more = "" if wanted != main else f"; `{install_extra('hdr')}` makes it the one that is read"
         warn(
             f"{path.name} holds {len(named)} video tracks: {named[reader.track]} is used, not "
             f"{', '.join(named[i] for i in others)}. To use {named[wanted]}, copy it with "
