@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from ..pipelines.status import StageStatus
 
 KEY_FIGURES = {
-    "frames": ("frames", "keyframes_placed", "calibration", "focal_px", "focal_sd_px", "gps"),
+    "frames": ("frames", "keyframes_placed", "calibration", "focal_px", "focal_sd_px", "still_left_out", "gps"),
     "proxy": ("depth", "semantics", "metric", "metres_per_unit", "classes"),
     "tracking": ("posed", "keyframes", "lost", "scale"),
     "mapping": ("gaussians", "keyframe_psnr"),

@@ -180,6 +180,10 @@ class FramesConfig:
         "auto", "auto leaves people out where networks for them are in the cache; keep takes them for scene",
         ("auto", "keep"),
     )  # fmt: skip
+    still: str = setting(
+        "auto", "auto leaves out what stands still in the image while the rest moves (a bonnet, a display, a frame "
+        "around it); keep takes it for scene", ("auto", "keep"),
+    )  # fmt: skip
     least_piece: int = setting(
         8, "keyframes that cannot be placed among the others but among each other make a piece, from so many on",
         within=(3, 1_000_000),

@@ -178,7 +178,20 @@ def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Loo
     lost = [f"frames {s.first}–{s.last} ({s.start:.2f}–{s.end:.2f} s): {s.reason}" for s in lost_stretches(outcome)]
     rows.append(("frames without a pose", f"{len(lost)} stretches, below" if lost else f"none of {len(t.frame_ids)}"))
     extra = f"<h3>Frames without a pose</h3>{bullets(lost)}" if lost else ""
+    if share := outcome.records["frames"].figures.get("still_left_out"):
+        rows.append(("stands still, left out", f"{share:.1%} of the image"))
+        extra += _still_picture(outcome)
     return section("What was found", table(("", ""), rows), extra)
+
+
+def _still_picture(outcome: Outcome) -> str:
+    """The middle frame, red where something is left out."""
+    frame = outcome.frames[len(outcome.frames) // 2]
+    photo, left_out = outcome.run.image(frame).copy(), outcome.run.left_out(frame)
+    if left_out is not None:
+        photo[left_out] = photo[left_out] // 2 + np.array([127, 0, 0], np.uint8)
+    caption = f"left out, {frame.timestamp:.2f} s"
+    return f'<div class="grid"><div>{image(at_most_wide(photo, _TILE_WIDTH), caption)}{caption}</div></div>'
 
 
 def _scale_text(outcome: Outcome) -> str:

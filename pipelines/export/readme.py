@@ -52,8 +52,8 @@ _ENTRIES = (
     ),
     Entry(
         "masks/",
-        "parts left out for people or by --masks: NAME.png for the frame NAME, black is left out (colmap "
-        "feature_extractor --ImageReader.mask_path masks).",
+        "parts left out for people, as standing still, or by --masks: NAME.png for the frame NAME, black is left out "
+        "(colmap feature_extractor --ImageReader.mask_path masks).",
         "colmap",
     ),
     Entry(

@@ -1,4 +1,5 @@
-"""Masks of the frames: files of the user, read as the source reads its images, and people found by networks."""
+"""Masks of the frames: files of the user, read as the source reads its images, what stands still while the rest of the
+image moves, and people found by networks."""
 
 from __future__ import annotations
 
@@ -55,7 +56,8 @@ def _cards(config: Config) -> PeopleCards | None:
 
 
 class FrameMasks:
-    """The user's masks of all frames, and people in those in which they were looked for, all before undistortion.
+    """The user's masks of all frames, what stands still in them, and people in those in which they were looked for, all
+    before undistortion.
 
     `folder` keeps what was found; `picked` names the image of a frame.
     """
@@ -67,7 +69,7 @@ class FrameMasks:
         self._source = source
         self._files = open_masks(Path(config.frames.masks), source) if config.frames.masks else MaskFiles({})
         self._cards = _cards(config)
-        self._folder, self._picked, self._threads = folder, picked, threads
+        self.folder, self._picked, self._threads = folder, picked, threads
         self._faces, self._rig = faces, rig
 
     def find_people(self, frames: Sequence[Frame], keyframes: Sequence[int], progress: Progress) -> None:
@@ -83,12 +85,12 @@ class FrameMasks:
         self._search(finder, [frames[k] for k in near], progress)
 
     def _search(self, finder: PeopleFinder, frames: Sequence[Frame], progress: Progress) -> None:
-        todo = [f for f in frames if LEFT_OUT.find(self._folder, f.name) is None]
+        todo = [f for f in frames if LEFT_OUT.find(self.folder, f.name) is None]
         for frame in progress.track(todo, "people", len(todo)) if todo else ():
-            LEFT_OUT.save(self._folder, finder.left_out(read_rgb(self._picked / frame.name)), frame.name)
+            LEFT_OUT.save(self.folder, finder.left_out(read_rgb(self._picked / frame.name)), frame.name)
 
     def _shows_people(self, frame: Frame) -> bool:
-        found = LEFT_OUT.find(self._folder, frame.name)
+        found = LEFT_OUT.find(self.folder, frame.name)
         return found is not None and bool(found.any())
 
     def left_out(self, frame: Frame, width: int, height: int) -> NDArray[np.bool_] | None:
@@ -97,8 +99,16 @@ class FrameMasks:
         given = any_of((self._files.left_out(frame.source_index, *size), self._transparent(frame.source_index, size)))
         if given is not None and self._faces is not None:
             given = self._faces.cut_mask(given, frame.id // self._rig.stations)
-        both = any_of((given, LEFT_OUT.find(self._folder, frame.name)))
-        return both if both is not None and both.any() else None
+        found = any_of((given, self._still(frame, width, height), LEFT_OUT.find(self.folder, frame.name)))
+        return found if found is not None and found.any() else None
+
+    def save_still(self, left_out: NDArray[np.bool_], direction: int) -> None:
+        """Leave out what stands still (h, w), of any size, in all frames of a direction of the rig."""
+        LEFT_OUT.save(self.folder, left_out, _still_name(direction))
+
+    def _still(self, frame: Frame, width: int, height: int) -> NDArray[np.bool_] | None:
+        found = LEFT_OUT.find(self.folder, _still_name(frame.id // self._rig.stations))
+        return None if found is None else reduce_mask(found, width, height)
 
     def _transparent(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_] | None:
         """(height, width) of the source's image `index`, its transparent background at a size (width, height)."""
@@ -217,7 +227,11 @@ def grey_of(context: StageContext, masks: FrameMasks, frame: Frame) -> Picture:
     return gray, masks.left_out(frame, gray.shape[1], gray.shape[0])
 
 
+def _still_name(direction: int) -> str:
+    return f"still_{direction}"
+
+
 def masks_of(context: StageContext, source: Source, faces: Faces | None, rig: Rig) -> FrameMasks:
     """Return the masks of all frames; people only in frames that have been searched."""
-    places = context.snapshot / "people", context.snapshot / "picked"
+    places = context.snapshot / "left_out", context.snapshot / "picked"
     return FrameMasks(context.config, source, *places, context.threads, faces, rig)

@@ -37,6 +37,7 @@ from .inputs import require_several
 from .keyframes import KeyframeChoice, choose_keyframes, pick_frames
 from .masks import FrameMasks, grey_of, masks_of, picked
 from .priors import solve
+from .still import StillShare, leave_out_still
 from .tasks import TASKS, known_camera, structure_from_motion
 
 _FEW_KEYFRAMES = 12
@@ -59,6 +60,7 @@ def run(context: StageContext) -> dict[str, Any]:
     given = given_poses(context.config.frames, source, frames, context.warn)
     rig = rig_of(1 if faces is None else len(faces), len(frames))
     masks = masks_of(context, source, faces, rig)
+    still = leave_out_still(context, masks, frames, rig)
     try:
         keyframes = _keyframes(context, frames, masks, rig)
         masks.find_people(frames, keyframes, context.progress)
@@ -68,6 +70,8 @@ def run(context: StageContext) -> dict[str, Any]:
     except InputError as error:
         if blame := masks.blame(frames, camera.width, camera.height):
             raise InputError(blame) from error
+        if still.note:
+            raise InputError(f"{error}{still.note}") from error
         raise
     told = {} if given is None else warn_of_given(context, structure, given, frames, keyframes)
     lens = make_lens(structure.model.cameras[1])
@@ -80,7 +84,8 @@ def run(context: StageContext) -> dict[str, Any]:
         noise = warn_of_defects(context, [grey_of(context, masks, frames[k])[0] for k in evenly], straight)
         if structure.focal_sd:
             focal_sd = math.hypot(focal_sd, noise * structure.model.cameras[1].mean_focal_length())
-    calibration = replace(_calibration(context, lens, origin, focal_sd, faces), readout=structure.readout)
+    calibration = _calibration(context, lens, origin, focal_sd, faces, still)
+    calibration = replace(calibration, readout=structure.readout)
     _write_backbone(context, structure, keyframes, lens, frames)
     _write_correspondences(context, structure, keyframes, lens)
     _write_frames(context, source, frames, lens)
@@ -91,7 +96,7 @@ def run(context: StageContext) -> dict[str, Any]:
         GIVEN_POSES.save(context.folder, given)
     panoramas = {"panoramas": rig.stations} if len(rig) > 1 else {}
     told |= places_figure(source, frames) | ({} if source.has_times else {"timed": False})
-    return _figures(frames, structure, calibration) | told | panoramas | masked
+    return _figures(frames, structure, calibration) | told | panoramas | masked | still.figures
 
 
 def places_figure(source: Source, frames: list[Frame]) -> dict[str, str]:
@@ -168,12 +173,14 @@ def _structure(
     return structure, origin
 
 
-def _calibration(context: StageContext, lens: Lens, origin: str, focal_sd: float, faces: Faces | None) -> Calibration:
+def _calibration(
+    context: StageContext, lens: Lens, origin: str, focal_sd: float, faces: Faces | None, still: StillShare
+) -> Calibration:
     focal_sd *= lens.pinhole.fx / lens.camera.focal_length_x
     if focal_sd > _UNSURE_FOCAL * lens.pinhole.fx:
         context.warn(
             f"the focal length is uncertain: {lens.pinhole.fx:.0f} ± {focal_sd:.0f} px. If you know the intrinsics, "
-            "pass --intrinsics"
+            f"pass --intrinsics" + still.note
         )
     if faces is None:
         return Calibration(lens.pinhole, origin, focal_sd, distortion_of(lens.camera))

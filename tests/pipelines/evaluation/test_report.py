@@ -28,8 +28,9 @@ from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, write_evaluati
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run.files import TRAJECTORY
+from msgs_slam.pipelines.run.files import FRAMES, LEFT_OUT, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.manifest import read_manifest, write_manifest
 from msgs_slam.pipelines.scene.world import SAME, WORLD, World
 from msgs_slam.pipelines.types import LoopEdge
 from tests.browser import BROWSER, browser
@@ -138,6 +139,22 @@ def test_the_report_shows_the_mesh_and_links_the_page_beside_it(oracle_run: Orac
     assert "export/map.html" not in write_report(run, tmp_path / "other.html").read_text()
     (export / "mesh.glb").write_bytes(b"no mesh")
     assert ">The mesh<" not in write_report(run).read_text()
+
+
+def test_the_report_shows_what_stands_still(oracle_run: OracleRun) -> None:
+    run = oracle_run()
+    frame = run.load(FRAMES)[16]
+    left_out = np.zeros(run.image(frame).shape[:2], bool)
+    left_out[-20:] = True
+    LEFT_OUT.save(run.stage("frames"), left_out, frame.name)
+    note_finished(run, ("frames", "proxy", "tracking"))
+    assert "stands still" not in write_report(run).read_text()
+    manifest = read_manifest(run.manifest_file)
+    frames = replace(manifest.records["frames"], figures={"still_left_out": 0.125})
+    write_manifest(run.manifest_file, replace(manifest, records={**manifest.records, "frames": frames}))
+    html = write_report(run).read_text()
+    assert "<td>stands still, left out</td><td>12.5% of the image</td>" in html
+    assert 'alt="left out, 1.60 s"' in html
 
 
 def test_report_of_a_run_without_a_map_and_with_lost_frames(oracle_run: OracleRun) -> None:
