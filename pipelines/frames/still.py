@@ -1,4 +1,4 @@
-"""What stands still in the images of a recording while the rest moves: found once, kept in the snapshot, and said."""
+"""Still parts of the images of a recording, while the rest moves: found once, kept in the snapshot, and said."""
 
 from __future__ import annotations
 
@@ -28,8 +28,9 @@ class StillShare:
     left_out: float = 0.0
     veil: float = 0.0
 
-    def __str__(self) -> str:
-        """Say what was found; nothing where nothing was."""
+    @property
+    def warnings(self) -> list[str]:
+        """Say what was found, and what to do."""
         said = []
         if self.left_out:
             said.append(
@@ -43,12 +44,17 @@ class StillShare:
                 "while what is behind it moves: poses and focal length may be wrong. Leave the worst of it out with "
                 "--masks, or film again without a pane, or with the lens close to it"
             )
-        return ". ".join(said)
+        return said
 
     @property
     def note(self) -> str:
-        """What a message adds for which it may be the reason."""
-        return f". Note that {self}" if str(self) else ""
+        """Sentence for the end of another message whose cause it may be; "" where nothing was found."""
+        noted = []
+        if self.left_out:
+            noted.append(f"{_percent(self.left_out)} of the image stands still while the rest moves and is left out")
+        if self.veil:
+            noted.append(f"a reflection or the like stands still over {_percent(self.veil)} of the image")
+        return f". Note that {' and '.join(noted)}" if noted else ""
 
     @property
     def figures(self) -> dict[str, float]:
@@ -77,8 +83,8 @@ def leave_out_still(context: StageContext, masks: FrameMasks, frames: Sequence[F
             "as on a turntable or in a small part of a screen, leave out all else with --masks FOLDER. Otherwise the "
             f"camera stands still and there is no parallax: {HOW_TO_FILM[0].lower()}{HOW_TO_FILM[1:]}"
         )
-    if str(still):
-        context.warn(str(still))
+    for warning in still.warnings:
+        context.warn(warning)
     return still
 
 

@@ -1,4 +1,4 @@
-"""What stands still in the image while the rest of it moves: it belongs to the camera, not to the scene.
+"""Detection of what stands still in the image while the rest of it moves: it belongs to the camera, not to the scene.
 
 A bonnet, a handlebar, a display that is burnt in, the frame around a screen recording. Over moments between which the
 image changed, the gradients of a scene that moves cancel out in the mean, and those of what stands still remain (as
@@ -45,8 +45,8 @@ _VEIL = 0.2
 
 @dataclass(frozen=True)
 class StillPart:
-    """What stands still: (h, w) left out, and the share of the image over which a reflection stands still, which cannot
-    be left out."""
+    """The part of the image that stands still (h, w), and the share of the image over which a reflection does, which
+    cannot be left out."""
 
     left_out: NDArray[np.bool_]
     veil: float = 0.0
