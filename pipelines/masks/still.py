@@ -21,6 +21,8 @@ LOOKED_AT = 60
 _SIDE = 480
 _EDGE = 4.0
 """Grey levels across two pixels from which a gradient is one: all below is noise, compression and shading."""
+_FINE, _COARSE = 1.0, 1.7
+"""Pixels by which images are blurred, and again where motion is looked for: noise in the dark is no motion."""
 _FIRM, _LOOSE = 0.8, 0.5
 """Share of the moments in which a gradient is there, in parts that stand still, and in what is connected with them. In
 14 recordings where nothing does, one pixel in a thousand has up to 0.45, and 0.78 where the camera hardly moves."""
@@ -29,9 +31,10 @@ _CONSTANT = 3.0
 _WINDOW, _CORNER = 15, 0.1
 """Pixels of the window whose gradients make a corner, and ratio of the smaller to both eigenvalues of their structure
 tensor."""
-_MIN_CORNERS, _MIN_IN_ALL = 12, 100
-"""Pixels of corners in a part, and in all parts: the point towards which a camera moves has up to 60 around it. Fewer
-give a handful of features, which no geometry follows."""
+_MIN_CORNERS, _MIN_IN_ALL, _DENSE = 12, 100, 0.09
+"""Pixels of corners in a part, and in all parts: the point towards which a camera moves has up to 60 around it, and
+fewer give a handful of features, which no geometry follows. And their share of the gradients of a part: displays have
+0.14 and more, a translucent word 0.1, what trembles far away by a pixel 0.04, a wall before which people walk 0.08."""
 _RIM = 4
 """Pixels at the border of the image that say nothing: some cameras leave black lines there."""
 _GAP, _MARGIN, _HOLE = 0.015, 3, 0.01
@@ -58,7 +61,7 @@ def find_still(pictures: Iterable[tuple[NDArray[np.uint8], NDArray[np.bool_] | N
     reduced = [_reduced(*picture) for picture in pictures]
     if len(reduced) < _MIN_MOMENTS or len({grey.shape for grey, _ in reduced}) > 1:
         return None
-    moments = _moments(reduced)
+    moments = _moments([(_blurred(grey, _COARSE), left_out) for grey, left_out in reduced])
     if len(moments) < _MIN_MOMENTS:
         return None
     gradient, presence, spread = _statistics([reduced[i] for i in moments])
@@ -66,21 +69,25 @@ def find_still(pictures: Iterable[tuple[NDArray[np.uint8], NDArray[np.bool_] | N
     constant = spread < _CONSTANT
     loose = (presence > _LOOSE) & (strength > (_EDGE / 2) ** 2)
     corners = _corners(gradient, (presence > _FIRM) & (strength > _EDGE**2))
-    veil = float((_parts(loose, _corners(gradient, loose)) & ~_closed(constant)).mean())
+    veil = float((_parts(loose, _corners(gradient, loose), loose) & ~_closed(constant)).mean())
     if veil > _VEIL:
-        return StillPart(_parts(constant, corners), veil)
-    return StillPart(_parts(constant | loose, corners))
+        return StillPart(_parts(constant, corners, loose), veil)
+    return StillPart(_parts(constant | loose, corners, loose))
 
 
 _Reduced = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
 
 
 def _reduced(grey: NDArray[np.uint8], left_out: NDArray[np.bool_] | None) -> _Reduced:
-    small = np.asarray(cv2.GaussianBlur(reduce_image(grey, _SIDE), (0, 0), 1.0), np.uint8)
+    small = _blurred(reduce_image(grey, _SIDE), _FINE)
     if left_out is None:
         return small, None
     hidden = cv2.resize(left_out.astype(np.uint8), small.shape[::-1], interpolation=cv2.INTER_NEAREST)
     return small, cv2.dilate(hidden, _disc(_MARGIN + 2)) > 0
+
+
+def _blurred(grey: NDArray[np.uint8], sigma: float) -> NDArray[np.uint8]:
+    return np.asarray(cv2.GaussianBlur(grey, (0, 0), sigma), np.uint8)
 
 
 def _gradient(picture: _Reduced) -> NDArray[np.float32]:
@@ -145,12 +152,13 @@ def _corners(gradient: NDArray[np.float32], firm: NDArray[np.bool_]) -> NDArray[
     return np.asarray(inside & (smaller > _CORNER * (xx + yy)))
 
 
-def _parts(candidates: NDArray[np.bool_], corners: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(h, w) pieces of candidates, joined over small gaps, that have corners; with what they enclose and a margin."""
+def _parts(candidates: NDArray[np.bool_], corners: NDArray[np.bool_], loose: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(h, w) pieces of candidates, joined over small gaps, of whose loose gradients enough are corners; with what they
+    enclose and a margin."""
     _, piece = cv2.connectedComponents(_closed(candidates).astype(np.uint8))
-    count = np.bincount(piece.ravel(), corners.ravel())
-    count[0] = 0
-    kept = count >= _MIN_CORNERS
+    count, gradients = (np.bincount(piece.ravel(), found.ravel()) for found in (corners, loose))
+    kept = (count >= _MIN_CORNERS) & (count > _DENSE * gradients)
+    kept[0] = False
     if count[kept].sum() < _MIN_IN_ALL:
         return np.zeros(candidates.shape, np.bool_)
     found = np.asarray(kept[piece])
