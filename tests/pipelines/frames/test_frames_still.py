@@ -81,3 +81,16 @@ def test_a_turntable_is_named_and_not_told_to_walk_only(
     said = re.escape("of the image stands still while the rest moves. If the scene is what moves, as on a turntable")
     with pytest.raises(InputError, match=rf"^8\d% {said}.*--masks FOLDER.*Otherwise.*film again"):
         run(make_context(tmp_path / "table"))
+
+
+@pytest.mark.parametrize("wide", [40, 110])
+def test_a_tripod_before_which_something_passes_is_no_moving_camera(
+    bent_walk: Walk, tmp_path: Path, make_context: Callable[..., StageContext], wide: int
+) -> None:
+    still, board = read_rgb(sorted(bent_walk.folder.iterdir())[0]), bonnet()[:, :wide]
+    for i in range(16):
+        image, x = still.copy(), 5 + 11 * i
+        image[60 : 60 + len(board), x : x + wide] = board
+        write_rgb(tmp_path / "tripod" / f"{i:02d}.png", image)
+    with pytest.raises(InputError, match="camera stands still"):
+        run(make_context(tmp_path / "tripod"))
