@@ -148,7 +148,7 @@ def test_the_report_shows_what_stands_still(oracle_run: OracleRun) -> None:
     left_out[-20:] = True
     LEFT_OUT.save(run.stage("frames"), left_out, frame.name)
     note_finished(run, ("frames", "proxy", "tracking"))
-    assert "stands still" not in write_report(run).read_text()
+    assert "stands still, left out" not in write_report(run).read_text()
     manifest = read_manifest(run.manifest_file)
     frames = replace(manifest.records["frames"], figures={"still_left_out": 0.125})
     write_manifest(run.manifest_file, replace(manifest, records={**manifest.records, "frames": frames}))
