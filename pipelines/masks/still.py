@@ -93,7 +93,8 @@ def _blurred(grey: NDArray[np.uint8], sigma: float) -> NDArray[np.uint8]:
 def _gradient(picture: _Reduced) -> NDArray[np.float32]:
     """(2, h, w) grey levels across two pixels, 0 in what is left out."""
     grey, left_out = picture
-    found = np.stack([cv2.Sobel(grey, cv2.CV_32F, *axis, ksize=1) for axis in ((1, 0), (0, 1))])
+    axes = [cv2.Sobel(grey, cv2.CV_32F, *axis, ksize=1) for axis in ((1, 0), (0, 1))]
+    found: NDArray[np.float32] = np.stack(axes).astype(np.float32, copy=False)
     if left_out is not None:
         found[:, left_out] = 0
     return found
@@ -135,11 +136,11 @@ def _statistics(pictures: Sequence[_Reduced]) -> tuple[NDArray[np.float32], NDAr
         energy += (gradient**2).sum(0)
         grey += value
         squares += value**2
-    count = np.float32(len(pictures))
-    mean = total / count
-    presence = (mean**2).sum(0) / np.maximum(energy / count, np.float32(1e-6))
-    spread = np.sqrt(np.maximum(squares / len(pictures) - (grey / len(pictures)) ** 2, 0))
-    return mean, presence, spread.astype(np.float32)
+    count = len(pictures)
+    mean: NDArray[np.float32] = (total / count).astype(np.float32, copy=False)
+    presence = (mean**2).sum(0) / np.maximum(energy / count, 1e-6)
+    spread = np.sqrt(np.maximum(squares / count - (grey / count) ** 2, 0))
+    return mean, presence.astype(np.float32), spread.astype(np.float32)
 
 
 def _corners(gradient: NDArray[np.float32], firm: NDArray[np.bool_]) -> NDArray[np.bool_]:
