@@ -177,8 +177,8 @@ class FramesConfig:
         ),
     )  # fmt: skip
     people: str = setting(
-        "auto", "auto leaves people out where networks for them are in the cache; keep takes them for scene",
-        ("auto", "keep"),
+        "auto", "auto leaves out who moves, where networks for people are in the cache; mask everybody; keep nobody",
+        ("auto", "mask", "keep"),
     )  # fmt: skip
     still: str = setting(
         "auto", "auto leaves out what stands still in the image while the rest moves (a bonnet, a display, a frame "

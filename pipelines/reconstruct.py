@@ -45,7 +45,7 @@ def all_stages(method: str = "default") -> list[Stage]:
     return [
         Stage(
             "frames", Later("frames.stage"), frames_inputs, check_frames,
-            auto=lambda config: ("people",) if config.frames.people == "auto" else (), division=frames_division,
+            auto=lambda config: ("people",) if config.frames.people != "keep" else (), division=frames_division,
         ),
         Stage("proxy", Later("proxy.stage"), proxy_inputs, check_proxy, left_to_auto),
         *between,

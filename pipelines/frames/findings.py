@@ -1,7 +1,7 @@
 """Findings of structure from motion for the user: gaps, contradictions, and what became of given poses and cameras."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,9 @@ _APART, _ZOOM, _OFF = 5.0, 0.03, 0.05
 """Standard deviations by which two focal lengths contradict each other, if they are also so far apart relatively: those
 of two halves of a recording, and one found beside one known before. Halves of five recordings without zoom: up to 3.2.
 """
+
+_COSTLY = 1 / 3
+"""Share of the matches that masks of people may cost unmentioned."""
 
 
 def settled_origin(context: StageContext, origin: str, camera: pycolmap.Camera, structure: Structure) -> str:
@@ -129,6 +132,24 @@ def warn_of_structure(context: StageContext, structure: Structure, ids: list[int
         context.warn(
             f"images taken far apart contradict the camera's path: {agreeing}. Either repeated structures were "
             "confused, which is harmless, or a loop is not closed"
+        )
+
+
+def warn_of_people(context: StageContext, judged: Mapping[str, int] | None, structure: Structure) -> None:
+    """Warn of what looks like people and stands still (`judged`: see `FrameMasks`), and where a structure without those
+    who move has lost many matches."""
+    if judged is None:
+        return
+    if judged["still"]:
+        context.warn(
+            f"{judged['still']} of {judged['named']} regions of keyframes that look like people stand as still as the "
+            "scene and are kept as part of it. To leave them out, set frames.people=mask"
+        )
+    left = sum(len(p.matches) for p in structure.pairs)
+    if left < (1 - _COSTLY) * judged["matches"]:
+        context.warn(
+            f"people who move are left out, and with them {1 - left / judged['matches']:.0%} of the matches between "
+            "keyframes: poses rest on what is left. Film with fewer people in view, or set frames.people=keep"
         )
 
 

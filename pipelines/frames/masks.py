@@ -3,8 +3,10 @@ image moves, and people found by networks."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from bisect import bisect
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +18,7 @@ from ...formats.errors import InputError
 from ...formats.image_folder import frame_number, natural_key
 from ...formats.images import image_size, read_rgb, to_grey
 from ...formats.reading import files_sha256
+from ...formats.textfile import read_json, write_json
 from ..config import Config
 from ..engine.stages import StageContext
 from ..geometry.camera import ONE_CAMERA, Rig
@@ -27,6 +30,7 @@ from ..system.progress import Progress
 from ..types import Frame, any_of
 
 if TYPE_CHECKING:
+    from ..masks.static import Parts
     from ..sfm.flow import Picture
     from ..sfm.lens import Lens
     from ..source.faces import Faces
@@ -52,14 +56,15 @@ def check_masks(source: Path, config: Config) -> None:
 
 
 def _cards(config: Config) -> PeopleCards | None:
-    return people_cards(ModelStore.open()) if config.frames.people == "auto" else None
+    return people_cards(ModelStore.open()) if config.frames.people != "keep" else None
 
 
 class FrameMasks:
     """The user's masks of all frames, what stands still in them, and people in those in which they were looked for, all
     before undistortion.
 
-    `folder` keeps what was found; `picked` names the image of a frame.
+    `folder` keeps what the networks name, and `folder / "moving"` what of it is left out: what moves, or all of it with
+    `frames.people=mask`; `picked` names the image of a frame.
     """
 
     def __init__(
@@ -68,30 +73,85 @@ class FrameMasks:
     ) -> None:  # fmt: skip
         self._source = source
         self._files = open_masks(Path(config.frames.masks), source) if config.frames.masks else MaskFiles({})
-        self._cards = _cards(config)
+        self._cards, self._is_forced = _cards(config), config.frames.people == "mask"
         self.folder, self._picked, self._threads = folder, picked, threads
         self._faces, self._rig = faces, rig
 
     def find_people(self, frames: Sequence[Frame], keyframes: Sequence[int], progress: Progress) -> None:
-        """Look for people in the keyframes, and in every frame up to the next keyframe on either side of one that shows
-        any; what is on disk stays."""
-        if self._cards is None:
+        """Look for people in the keyframes; what is on disk stays."""
+        if self._cards is not None:
+            self._search([frames[k] for k in keyframes], progress)
+            if self._is_forced and self.judged is None:
+                self.leave_out(frames, keyframes, None, 0, progress)
+
+    @property
+    def _table(self) -> Path:
+        return self.folder / "moving" / "judged.json"
+
+    @property
+    def judged(self) -> dict[str, int] | None:
+        """How many regions of keyframes the networks name, how many of them stand still and how many move for sure, and
+        the `matches` of keyframes with all of them; None before `leave_out`."""
+        return read_json(self._table) if self._table.exists() else None
+
+    @property
+    def any_moves(self) -> bool:
+        """Whether people move, so that structure from motion is made without them."""
+        return (found := self.judged) is not None and found["moving"] > 0
+
+    def regions(self, frames: Sequence[Frame], numbers: Iterable[int]) -> list[NDArray[np.int32]]:
+        """(h, w) the regions that the networks name in each of these frames, which were searched (see `regions_of`);
+        nothing without networks."""
+        from ..masks.static import regions_of  # imports pycolmap
+
+        found = (LEFT_OUT.find(self.folder, frames[k].name) for k in numbers if self._cards is not None)
+        return [regions_of(named) for named in found if named is not None]
+
+    def leave_out(
+        self,
+        frames: Sequence[Frame],
+        keyframes: Sequence[int],
+        judged: Sequence[Parts] | None,
+        matches: int,
+        progress: Progress,
+    ) -> None:
+        """Leave out what does not stand still in the keyframes (`judged`: as of `find_still`, None: all that is named
+        moves), and in every frame up to the next keyframe on either side of one that shows such, what is not nearer to
+        what stands still there."""
+        if judged is None:
+            judged = [
+                (r, np.where(np.arange(r.max() + 1) == 0, 1, -1).astype(np.int8))
+                for r in self.regions(frames, keyframes)
+            ]
+        kept = [(verdict[parts] > 0) & (parts > 0) for parts, verdict in judged]
+        moving = [verdict[parts] <= 0 for parts, verdict in judged]
+        for k, area in zip(keyframes, moving, strict=True):
+            self._save_moving(frames[k], area)
+        ends = [0, *keyframes, len(frames) - 1]
+        near = {k for i, area in enumerate(moving) if area.any() for k in range(ends[i], ends[i + 2] + 1)}
+        self._search([frames[k] for k in sorted(near)], progress)
+        for k in sorted(near - set(keyframes)):
+            beside = slice(max(bisect(keyframes, k) - 1, 0), bisect(keyframes, k) + 1)
+            self._save_moving(frames[k], ~_nearer(*(reduce(np.logical_or, areas[beside]) for areas in (kept, moving))))
+        verdicts = np.concatenate([verdict[np.unique(parts[parts > 0])] for parts, verdict in judged])
+        counts = {"named": len(verdicts), "still": int((verdicts > 0).sum()), "moving": int((verdicts < 0).sum())}
+        write_json(self._table, counts | {"matches": matches})
+
+    def _search(self, frames: Sequence[Frame], progress: Progress) -> None:
+        todo = [f for f in frames if LEFT_OUT.find(self.folder, f.name) is None]
+        if not todo or self._cards is None:
             return
         finder = PeopleFinder(self._cards, self._threads)
-        self._search(finder, [frames[k] for k in keyframes], progress)
-        shown = [i for i, k in enumerate(keyframes) if self._shows_people(frames[k])]
-        ends = [0, *keyframes, len(frames) - 1]
-        near = sorted({k for i in shown for k in range(ends[i], ends[i + 2] + 1)})
-        self._search(finder, [frames[k] for k in near], progress)
-
-    def _search(self, finder: PeopleFinder, frames: Sequence[Frame], progress: Progress) -> None:
-        todo = [f for f in frames if LEFT_OUT.find(self.folder, f.name) is None]
-        for frame in progress.track(todo, "people", len(todo)) if todo else ():
+        for frame in progress.track(todo, "people", len(todo)):
             LEFT_OUT.save(self.folder, finder.left_out(read_rgb(self._picked / frame.name)), frame.name)
 
-    def _shows_people(self, frame: Frame) -> bool:
-        found = LEFT_OUT.find(self.folder, frame.name)
-        return found is not None and bool(found.any())
+    def _save_moving(self, frame: Frame, reduced: NDArray[np.bool_]) -> None:
+        """Leave out what is named of a frame inside of a reduced mask."""
+        named = LEFT_OUT.find(self.folder, frame.name)
+        if named is not None and reduced.any():
+            size = named.shape[1], named.shape[0]
+            inside = cv2.resize(reduced.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+            LEFT_OUT.save(self.folder / "moving", named & inside, frame.name)
 
     def left_out(self, frame: Frame, width: int, height: int) -> NDArray[np.bool_] | None:
         """(height, width) of a picked frame; None where all of it is scene."""
@@ -99,7 +159,8 @@ class FrameMasks:
         given = any_of((self._files.left_out(frame.source_index, *size), self._transparent(frame.source_index, size)))
         if given is not None and self._faces is not None:
             given = self._faces.cut_mask(given, frame.id // self._rig.stations)
-        found = any_of((given, self._still(frame, width, height), LEFT_OUT.find(self.folder, frame.name)))
+        moving = LEFT_OUT.find(self.folder / "moving", frame.name) if self._table.exists() else None
+        found = any_of((given, self._still(frame, width, height), moving))
         return found if found is not None and found.any() else None
 
     def save_still(self, left_out: NDArray[np.bool_], direction: int) -> None:
@@ -138,7 +199,11 @@ class FrameMasks:
                 LEFT_OUT.save(folder, unseen, frame.name)
             if left_out is not None:
                 shares.append(float(left_out.mean()))
-        return {"masked_frames": len(shares), "masked_share": round(float(np.mean(shares)), 4)} if shares else {}
+        judged = self.judged or {}
+        found: dict[str, Any] = {f"people_{name}": judged[name] for name in ("named", "still") if judged}
+        if shares:
+            found |= {"masked_frames": len(shares), "masked_share": round(float(np.mean(shares)), 4)}
+        return found
 
 
 @dataclass(frozen=True)
@@ -160,6 +225,12 @@ class MaskFiles:
     def digest(self) -> str:
         """Changes with the names and contents."""
         return files_sha256((p.name, p) for p in self.paths.values())
+
+
+def _nearer(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(h, w) the pixels that are nearer to one area (h, w) than to another."""
+    away = [cv2.distanceTransform((~a).astype(np.uint8), cv2.DIST_L2, 3) for a in (first, second)]
+    return np.asarray(away[0] < away[1])
 
 
 def reduce_mask(left_out: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:

@@ -1,7 +1,7 @@
 """Stage 1: pictures of the source become frames with timestamps, a calibrated camera and a backbone of keyframes."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from ...formats.video import VideoFrame
 from ..engine.stages import StageContext
 from ..engine.tasks import in_chunks
 from ..geometry.camera import Rig, rig_of
+from ..masks.static import find_still
 from ..run.extension import parent_of
 from ..run.files import BACKBONE, CALIBRATION, FEATURES, GIVEN_POSES, MATCHED_PAIRS, SPARSE, VOCABULARY, save_frames
 from ..sfm.driver import Structure
@@ -32,7 +33,15 @@ from ..source.sharpness import reduce_image
 from ..system.parallel import parallel_map
 from ..types import Calibration, Frame, GivenPoses
 from .defects import warn_of_defects
-from .findings import in_world_of, settled_origin, to_sparse_model, warn_of_focal, warn_of_given, warn_of_structure
+from .findings import (
+    in_world_of,
+    settled_origin,
+    to_sparse_model,
+    warn_of_focal,
+    warn_of_given,
+    warn_of_people,
+    warn_of_structure,
+)
 from .inputs import require_several
 from .keyframes import KeyframeChoice, choose_keyframes, pick_frames
 from .masks import FrameMasks, grey_of, masks_of, picked
@@ -163,14 +172,44 @@ def _structure(
 ) -> tuple[Structure, str]:
     """The structure, and the origin of its camera."""
 
-    def divide(name: str, count: int, known: dict[str, NDArray]) -> None:
-        if count:
-            in_chunks(context, TASKS[name], count, motion, frames=frames, keyframes=keyframes, **known)
+    def solved(context: StageContext) -> tuple[Structure, str]:
+        def divide(name: str, count: int, known: dict[str, NDArray]) -> None:
+            if count:
+                in_chunks(context, TASKS[name], count, motion, frames=frames, keyframes=keyframes, **known)
 
-    motion = structure_from_motion(context, *camera, frames, masks, rig, given, has_times, divide)
-    structure, origin = solve(context, motion, camera[1], keyframes)
+        motion = structure_from_motion(context, *camera, frames, masks, rig, given, has_times, divide)
+        return solve(context, motion, camera[1], keyframes)
+
+    structure, origin = _with_people(context, frames, keyframes, masks, solved) or solved(context)
+    warn_of_people(context, masks.judged, structure)
     warn_of_structure(context, structure, [frames[k].id for k in keyframes])
     return structure, origin
+
+
+def _with_people(
+    context: StageContext,
+    frames: list[Frame],
+    keyframes: list[int],
+    masks: FrameMasks,
+    solved: Callable[[StageContext], tuple[Structure, str]],
+) -> tuple[Structure, str] | None:
+    """Structure and origin made of people too, unless some of them move: these are left out from then on. None where
+    that is so, or is known already, and where nobody is seen."""
+    regions = [] if masks.judged else masks.regions(frames, keyframes)
+    if not any(r.any() for r in regions):
+        return None
+    trial = replace(context, warnings=[])
+    try:
+        found = solved(trial)
+    except InputError:  # what moves may fill the images
+        masks.leave_out(frames, keyframes, None, 0, context.progress)
+        return None
+    matches = sum(len(p.matches) for p in found[0].pairs)
+    masks.leave_out(frames, keyframes, find_still(regions, found[0]), matches, context.progress)
+    if masks.any_moves:
+        return None
+    context.warnings.extend(trial.warnings)
+    return found
 
 
 def _calibration(

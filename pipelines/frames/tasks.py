@@ -14,10 +14,11 @@ from ..engine.tasks import Chunk
 from ..geometry.camera import Rig, rig_of
 from ..run.extension import parent_of
 from ..sfm.driver import Divide, StructureFromMotion, no_prefetch
+from ..sfm.features import clear_of
 from ..sfm.lens import FOCAL_GUESS, calibrated_camera, to_pycolmap, unknown_camera
 from ..sfm.matching import match_features
 from ..sfm.rolling import frame_interval
-from ..sfm.snapshots import Snapshots
+from ..sfm.snapshots import Snapshots, features_name
 from ..source.faces import Faces, find_faces
 from ..source.given import given_poses, read_intrinsics
 from ..source.opening import Source, open_source
@@ -71,9 +72,21 @@ def structure_from_motion(
     learned, before = open_learned(settings), parent_of(context.source)
     start = given.cam_from_world if given is not None else None
 
+    snapshots = whole = Snapshots(context.snapshot)
+    if masks.any_moves:
+        snapshots = Snapshots(context.snapshot / "without_people")
+        snapshots.folder.mkdir(exist_ok=True)
+
     def extract(frame_id: int) -> Features:
-        rgb = read_rgb(picked(context, frames[frame_id].name))
-        return picture_features(rgb, masks.left_out(frames[frame_id], *size), settings, learned)
+        left_out = masks.left_out(frames[frame_id], *size)
+
+        def found() -> Features:
+            return picture_features(read_rgb(picked(context, frames[frame_id].name)), left_out, settings, learned)
+
+        if snapshots is whole:
+            return found()
+        features = whole.value(features_name(frame_id), found)  # those with people are there where these were judged
+        return features if left_out is None else clear_of(features, left_out)
 
     return StructureFromMotion(
         config=settings,
@@ -87,7 +100,7 @@ def structure_from_motion(
         picture=lambda frame_id: grey_of(context, masks, frames[frame_id]),
         time=lambda frame_id: frames[frame_id].timestamp,
         match=match_features if learned is None else partial(learned.match, size=size),
-        snapshots=Snapshots(context.snapshot),
+        snapshots=snapshots,
         progress=context.progress,
         threads=context.threads,
         seed=context.config.run.seed,

@@ -60,7 +60,7 @@ class ProxyWork:
         recording = open_recording(context.source, config.run.format)
         return ProviderContext(
             context.source, self.sequence, config.proxy, lambda name: context.snapshot / name, context.threads,
-            context.device, context.progress, recording, config.run.cache_mb, config.frames.people == "auto",
+            context.device, context.progress, recording, config.run.cache_mb, config.frames.people != "keep",
         )  # fmt: skip
 
     def posed(self, frames: list[Frame]) -> list[Frame]:

@@ -35,13 +35,17 @@ def extract_features(
     keypoints, found = _extractor(count, threshold).extract_from_uint8_array(np.ascontiguousarray(grey))
     if len(keypoints) == 0:
         return Features(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8))
-    table, descriptors = pycolmap.keypoints_to_matrix(keypoints), np.asarray(found.data, dtype=np.uint8)
-    if left_out is not None:
-        column, row = table[:, :2].astype(np.int64).T
-        away = cv2.distanceTransform((~left_out).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        kept = away[row.clip(0, away.shape[0] - 1), column.clip(0, away.shape[1] - 1)] > _SUPPORT * table[:, 2]
-        table, descriptors = table[kept], descriptors[kept]
-    return Features(table, descriptors)
+    features = Features(pycolmap.keypoints_to_matrix(keypoints), np.asarray(found.data, dtype=np.uint8))
+    return features if left_out is None else clear_of(features, left_out)
+
+
+def clear_of(features: Features, left_out: NDArray[np.bool_]) -> Features:
+    """Keep the features of an image that neither lie in its mask (H, W) nor reach into it."""
+    column, row = features.keypoints[:, :2].astype(np.int64).T
+    away = cv2.distanceTransform((~left_out).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    distance = away[row.clip(0, away.shape[0] - 1), column.clip(0, away.shape[1] - 1)]
+    kept = distance > _SUPPORT * features.keypoints[:, 2]
+    return Features(features.keypoints[kept], features.descriptors[kept])
 
 
 def _extractor(count: int, threshold: float) -> pycolmap.FeatureExtractor:

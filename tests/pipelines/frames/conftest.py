@@ -51,8 +51,11 @@ _PLANES = (
 )
 
 
-def render(center: NDArray, rotation: NDArray, focal: float = FOCAL, k1: float = 0.0) -> NDArray[np.uint8]:
-    """(H, W, 3) of the corner; `rotation` is world-from-camera, `k1` bends the rays as COLMAP's SIMPLE_RADIAL does."""
+def render(
+    center: NDArray, rotation: NDArray, focal: float = FOCAL, k1: float = 0.0, poster: bool = False
+) -> NDArray[np.uint8]:
+    """(H, W, 3) of the corner; `rotation` is world-from-camera, `k1` bends the rays as COLMAP's SIMPLE_RADIAL does.
+    A `poster` on the wall ahead is blue."""
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     bent = np.stack([(x - WIDTH / 2) / focal, (y - HEIGHT / 2) / focal], axis=-1)
     straight = bent.copy()
@@ -67,8 +70,16 @@ def render(center: NDArray, rotation: NDArray, focal: float = FOCAL, k1: float =
         points = center + rays * np.where(hit, depth, 0)[..., None]
         u, v = ((points[..., a] * 160 + 400).astype(np.float32) for a in axes)
         colors = cv2.remap(_texture(index), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        if poster and index == 1:
+            hangs = (np.abs(points[..., :2] - [0.3, 0.0]) < [0.8, 0.7]).all(-1)
+            colors[hangs] = bluish(colors[hangs])
         image[hit], nearest[hit] = colors[hit], depth[hit]
     return image
+
+
+def bluish(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Colours (..., 3) that the stand-ins of the networks take for a person."""
+    return (colors * np.array([0.2, 0.2, 0.5]) + np.array([0, 0, 127])).astype(np.uint8)
 
 
 def turn(yaw: float, pitch: float = 0.0) -> NDArray[np.float64]:

@@ -1,7 +1,10 @@
 """The whole stage with masks: something large that moves by itself leaves no trace."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import cv2
 import numpy as np
@@ -10,10 +13,15 @@ import pytest
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_grey_png, read_rgb, write_grey_png, write_rgb
 from msgs_slam.pipelines.engine.stages import StageContext
+from msgs_slam.pipelines.frames.findings import warn_of_people
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.run.files import SPARSE
-from tests.pipelines.frames.conftest import HEIGHT, WIDTH, Walk
+from msgs_slam.pipelines.sfm.driver import Structure
+from tests.pipelines.frames.conftest import HEIGHT, WALK_FRAMES, WIDTH, Walk, bluish, render, sideways
+from tests.pipelines.frames.test_frames_stage import digests
+from tests.pipelines.proxy.tiny_tflite import blue_people
+from tests.pipelines.travelling import Travelling
 
 Moving = tuple[Path, Path, list[np.ndarray]]
 
@@ -84,3 +92,66 @@ def test_a_board_that_crosses_the_picture_leaves_no_trace(
         assert (left_out != covered[frame_id]).any()
         board = read_rgb(context.folder / name)[left_out].std()
         assert board > 50
+
+
+@pytest.fixture
+def stand_ins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MSGS_SLAM_CACHE", str(tmp_path / "cache"))
+    blue_people(tmp_path)
+
+
+@pytest.fixture
+def posters(tmp_path: Path) -> Path:
+    """The walk with a blue poster on a wall."""
+    for i, (center, rotation) in enumerate(sideways(WALK_FRAMES)):
+        write_rgb(tmp_path / "posters" / f"view_{i:03d}.png", render(center, rotation, poster=True))
+    return tmp_path / "posters"
+
+
+def test_what_looks_like_a_person_and_stands_still_is_scene(
+    stand_ins: None, posters: Path, make_context: Callable[..., StageContext]
+) -> None:
+    found = make_context(posters, name="found")
+    figures = run(found)
+    assert WALK_FRAMES == figures["people_still"] < figures["people_named"]
+    assert figures["masked_share"] < 0.01, "specks with too few matches to tell"
+    assert any("regions of keyframes that look like people stand as still" in m for m in found.warnings)
+    kept = make_context(posters, 'frames.people="keep"', name="kept")
+    run(kept)
+    poses, same = (digests(c.folder)["backbone/model.npz"] for c in (found, kept))
+    assert poses == same, "as if nobody had looked for people"
+    masked = run(make_context(posters, 'frames.people="mask"', name="masked"))
+    assert masked["masked_frames"] == WALK_FRAMES
+    assert 0.05 < masked["masked_share"] < 0.4
+
+
+def test_who_crosses_the_picture_is_left_out(
+    stand_ins: None, crossing: Moving, bent_walk: Walk, make_context: Callable[..., StageContext], tmp_path: Path
+) -> None:
+    """The board is blue, and there are no masks of it; workers, who get the tasks as files, leave it out too."""
+    pictures, _, covered = crossing
+    for path, left_out in zip(sorted(pictures.iterdir()), covered, strict=True):
+        image = read_rgb(path)
+        image[left_out] = bluish(image[left_out])
+        write_rgb(path, image)
+    context = replace(make_context(pictures), workers=Travelling(tmp_path, 2))
+    figures = run(context)
+    assert figures["people_still"] == 0 < figures["people_named"]
+    assert figures["masked_frames"] == len(covered)
+    model = SPARSE.read(context.folder / "backbone" / "model.npz")
+    centres = np.linalg.inv(model.cam_from_world)[:, :3, 3]
+    aligned = align_points(centres, bent_walk.centers[model.frame_ids])
+    assert 0 < np.linalg.norm(aligned.apply(centres) - bent_walk.centers[model.frame_ids], axis=1).max() < 0.05
+
+
+@pytest.mark.parametrize(("left", "said"), [(60, ["40% of the matches"]), (70, [])])
+def test_masks_that_cost_more_than_a_third_of_the_matches_are_warned_of(
+    make_context: Callable[..., StageContext], tmp_path: Path, left: int, said: list[str]
+) -> None:
+    context = make_context(tmp_path)
+    structure = cast(Structure, SimpleNamespace(pairs=[SimpleNamespace(matches=np.zeros((left // 2, 2)))] * 2))
+    warn_of_people(context, {"named": 3, "still": 0, "matches": 100}, structure)
+    assert len(context.warnings) == len(said)
+    assert all(part in message for part, message in zip(said, context.warnings, strict=True))
+    warn_of_people(context, None, structure)
+    assert len(context.warnings) == len(said)

@@ -1,5 +1,6 @@
 """What is no part of the scene: the user's masks, people by two networks, what moved; and who keeps clear of them."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from msgs_slam.pipelines.mapping.objective import Objective
 from msgs_slam.pipelines.mapping.views import View, make_view
 from msgs_slam.pipelines.masks.moving import MovingView, find_moving, look_once
 from msgs_slam.pipelines.masks.people import PeopleFinder, join_people, people_cards
+from msgs_slam.pipelines.masks.static import judge, parts_of, regions_of, things_of
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.providers import DepthEstimate, LabelEstimate
 from msgs_slam.pipelines.read_config import load_config
@@ -32,7 +34,7 @@ from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame, Intrinsics
 from tests.dense_volumes import to_dense
-from tests.pipelines.proxy.tiny_tflite import write_tflite
+from tests.pipelines.proxy.tiny_tflite import blue_people
 
 HEIGHT, WIDTH = 96, 128
 
@@ -161,21 +163,8 @@ def test_people_are_what_both_networks_are_sure_of() -> None:
 
 @pytest.fixture
 def stand_ins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModelStore:
-    """Networks of the real ones' contracts to which blue is a person."""
     monkeypatch.setenv("MSGS_SLAM_CACHE", str(tmp_path / "cache"))
-    store = ModelStore.open()
-    blue = write_tflite(
-        tmp_path / "p.tflite", [[-4, -4, 8.0]], [-3.0], "logistic", (256, 256), ("input_1", "raw"), "activation_10"
-    )
-    store.add(blue, "selfie-person", "my-person")
-    weight = np.zeros((32, 3))
-    weight[13] = 5 * np.array([-2, -2, 4.0])
-    bias = np.full(32, -20.0)
-    bias[1], bias[13] = 0.0, -15.0
-    names = ("MobilenetV2/MobilenetV2/input", "logits/semantic/BiasAdd")
-    classes = write_tflite(tmp_path / "c.tflite", weight.tolist(), bias.tolist(), "argmax", (512, 512), names)
-    store.add(classes, "deeplab-ade20k", "my-classes")
-    return ModelStore.open()
+    return blue_people(tmp_path)
 
 
 def test_stand_ins_of_the_networks_find_the_blue_person(stand_ins: ModelStore, pictures: Path) -> None:
@@ -208,6 +197,7 @@ def test_frames_between_are_searched_where_a_keyframe_shows_people(
         write_rgb(tmp_path / "picked" / frame.name, image)
     masks = FrameMasks(load_config(), open_source(tmp_path / "picked"), tmp_path / "people", tmp_path / "picked", 1)
     masks.find_people(frames, [0, 3, 6, 9], SilentProgress())
+    masks.leave_out(frames, [0, 3, 6, 9], None, 0, SilentProgress())
     searched = sorted(int(p.name[:6]) for p in (tmp_path / "people" / "masks").iterdir())
     assert searched == [0, *range(3, 10)]
     assert [f.id for f in frames if masks.left_out(f, WIDTH, HEIGHT) is not None] == [5, 6, 7]
@@ -217,6 +207,67 @@ def test_frames_between_are_searched_where_a_keyframe_shows_people(
 
     monkeypatch.setattr(PeopleFinder, "left_out", never)
     masks.find_people(frames, [0, 3, 6, 9], SilentProgress())
+
+    shutil.copytree(tmp_path / "people" / "masks", tmp_path / "stands" / "masks")
+    masks = FrameMasks(load_config(), open_source(tmp_path / "picked"), tmp_path / "stands", tmp_path / "picked", 1)
+    judged = [(r, np.ones(r.max() + 1, np.int8)) for r in masks.regions(frames, [0, 3, 6, 9])]
+    masks.leave_out(frames, [0, 3, 6, 9], judged, 0, SilentProgress())
+    assert [f.id for f in frames if masks.left_out(f, WIDTH, HEIGHT) is not None] == []
+
+
+def boxes(*columns: int | None) -> list[NDArray[np.int32]]:
+    """Regions of keyframes: a box at each of these columns, or none."""
+    shown = [np.zeros((120, 160), np.bool_) for _ in columns]
+    for image, column in zip(shown, columns, strict=True):
+        if column is not None:
+            image[20:100, column : column + 30] = True
+    return [regions_of(image) for image in shown]
+
+
+def test_pieces_that_nearly_touch_are_one_region() -> None:
+    named = np.zeros((480, 640), np.bool_)
+    named[100:300, 100:200] = named[310:330, 120:180] = named[100:300, 400:500] = True
+    found = regions_of(named)
+    assert found.max() == 2
+    assert found[40, 35] == found[80, 35] != found[40, 110]
+    assert not regions_of(np.zeros((480, 640), np.bool_)).any()
+
+
+def test_a_statue_and_who_walks_past_it_are_two_parts_of_one_outline() -> None:
+    region = boxes(60)[0]
+    column = np.broadcast_to(np.arange(160), region.shape)
+
+    def divided(stands: NDArray[np.bool_], every: int) -> NDArray[np.int32]:
+        seen = (region > 0) & (np.arange(region.size).reshape(region.shape) % every == 0)
+        return parts_of(region, np.stack([seen & stands, seen]).reshape(2, -1).astype(np.float64), 0.5)
+
+    left, right = (region > 0) & (column < 72), (region > 0) & (column > 78)
+    parts = divided(column < 75, 7)
+    assert len({*parts[left]}) == len({*parts[right]}) == 1
+    assert parts[50, 62] != parts[50, 88]
+    assert ((parts > 0) == (region > 0)).all()
+    np.testing.assert_array_equal(divided(column < 62, 7), region)  # a rim is no side
+    np.testing.assert_array_equal(divided(column < 75, 331), region)  # too few matches
+
+
+def test_who_walks_away_is_left_out_where_she_stood_before() -> None:
+    """In keyframes 0 to 3 she stands, then walks; what she is in 9 nobody knows, for nothing connects it."""
+    regions = boxes(50, 50, 51, 50, None, 57, 64, 71, None, 10)
+    things = things_of(regions)
+    assert len({int(t[1]) for t, r in zip(things, regions, strict=True) if r.any()}) == 2
+
+    def judged(shares: list[float | None], expected: float = 0.8) -> list[int]:
+        count = [0 if s is None else 100 for s in shares]
+        votes = [np.array([[0, (s or 0) * n], [0, n]]) if r.any() else np.zeros((2, 1))
+                 for s, n, r in zip(shares, count, regions, strict=True)]  # fmt: skip
+        return [int(s[1]) for s, r in zip(judge(votes, things, expected), regions, strict=True) if r.any()]
+
+    stands = [0.7, 0.75, 0.8, 0.7, None, 0.7, 0.72, 0.7, None, None]
+    assert judged(stands) == [1] * 7 + [0]
+    assert judged([0.7, 0.75, 0.8, 0.7, None, 0.7, 0.2, 0.1, None, 0.7]) == [-1] * 7 + [1]
+    assert judged(stands, 0.2) == [-1] * 7 + [0], "a structure that the rest contradicts says nothing of people"
+    unsure = [None if i == 2 else s for i, s in enumerate(stands)]
+    assert judged(unsure) == [1] * 7 + [0], "few matches: as the rest of the thing"
 
 
 def test_networks_of_other_kinds_in_the_cache_are_passed_by(stand_ins: ModelStore) -> None:

@@ -8,6 +8,8 @@ import numpy as np
 from ai_edge_litert import schema_py_generated as schema
 from numpy.typing import NDArray
 
+from msgs_slam.pipelines.networks.registry import ModelStore
+
 FLOAT, INT32, UINT8 = schema.TensorType.FLOAT32, schema.TensorType.INT32, schema.TensorType.UINT8
 OPERATORS = schema.BuiltinOperator
 
@@ -97,3 +99,20 @@ def write_tflite(
         build.operator(OPERATORS.LOGISTIC, [scores], [end])
     path.write_bytes(build.bytes([image], [end]))
     return path
+
+
+def blue_people(folder: Path) -> ModelStore:
+    """Networks for people, of the real ones' contracts, to which blue is a person, taken into the cache."""
+    store = ModelStore.open()
+    blue = write_tflite(
+        folder / "p.tflite", [[-4, -4, 8.0]], [-3.0], "logistic", (256, 256), ("input_1", "raw"), "activation_10"
+    )
+    store.add(blue, "selfie-person", "my-person")
+    weight = np.zeros((32, 3))
+    weight[13] = 5 * np.array([-2, -2, 4.0])
+    bias = np.full(32, -20.0)
+    bias[1], bias[13] = 0.0, -15.0
+    names = ("MobilenetV2/MobilenetV2/input", "logits/semantic/BiasAdd")
+    classes = write_tflite(folder / "c.tflite", weight.tolist(), bias.tolist(), "argmax", (512, 512), names)
+    store.add(classes, "deeplab-ade20k", "my-classes")
+    return ModelStore.open()
