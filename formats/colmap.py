@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .atomic import write_bytes, write_lines, write_text
+from .colmap_files import model_suffix, names_in_text, require_whole_files
 from .errors import InputError
 from .ply import slices
-from .reading import parsing, read_bytes, require_file
+from .reading import opened, parsing
 from .trajectory import FARTHEST, nearest_rotation, poses_from_quaternions
 
 if TYPE_CHECKING:
@@ -26,16 +27,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# Parameters of each of COLMAP's camera models, in the order of the models' ids (SIMPLE_PINHOLE first).
-_PARAMETER_COUNTS = dict(enumerate((3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)))
-_CAMERA_HEAD_BYTES = 4 + 4 + 8 + 8
-_IMAGE_HEAD_BYTES = 4 + 7 * 8 + 4
-_POINT_HEAD_BYTES = 8 + 3 * 8 + 3 + 8
-_POINT2D_BYTES = 8 + 8 + 8
-_TRACK_ELEMENT_BYTES = 4 + 4
-
-MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0")
-"""In which a project keeps its model."""
 _PINHOLE_MODEL_ID = 1
 _CAMERA_ID = 1
 _POINT2D = np.dtype([("xy", "<f8", 2), ("point3D_id", "<u8")])
@@ -135,14 +126,6 @@ def _require_sense(model: ColmapModel, folder: Path) -> None:
             raise InputError(f"the COLMAP model in {folder} is damaged ({problem}): copy or export it again")
 
 
-def model_suffix(folder: Path) -> str | None:
-    """Return ".bin" or ".txt" when the folder holds a complete model of that kind, else None."""
-    for suffix in (".bin", ".txt"):
-        if all((folder / f"{part}{suffix}").is_file() for part in ("cameras", "images", "points3D")):
-            return suffix
-    return None
-
-
 def _load(folder: Path) -> Any:
     import pycolmap  # half a second: only for those who read a model
 
@@ -153,12 +136,18 @@ def _load(folder: Path) -> Any:
             "(look in sparse/0)"
         )
     for part in ("cameras", "images", "points3D"):
-        require_file(folder / f"{part}{suffix}")
+        # COLMAP's recipe for known poses begins with an empty points3D.txt.
+        with opened(folder / f"{part}{suffix}", any_content=(part, suffix) == ("points3D", ".txt")):
+            pass
     if suffix == ".bin":
         require_whole_files(folder)
     reconstruction = pycolmap.Reconstruction()
     with parsing(f"the COLMAP model in {folder}", "such model"):
         (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))
+        if suffix == ".txt":
+            for number, name in names_in_text(folder / "images.txt").items():
+                if " " in name:
+                    reconstruction.images[int(number)].name = name
     return reconstruction
 
 
@@ -300,55 +289,6 @@ def _require_consistent(m: ColmapModel) -> None:
         raise ValueError("write_colmap_model: image names must be unique, not empty, and without line breaks")
     if not (np.isfinite(m.cam_from_world).all() and np.isfinite(m.points).all() and np.isfinite(m.obs_xy).all()):
         raise ValueError("write_colmap_model: got a value that is not finite")
-
-
-def require_whole_files(folder: Path) -> None:
-    """Walk through cameras.bin, images.bin and points3D.bin and check that each ends where its counts say.
-
-    pycolmap trusts the counts: it reads on past the end of a truncated file, into wrong cameras or into as much
-    memory as the machine has. Raises InputError naming the file.
-    """
-    for name, walk in (("cameras", _walk_cameras), ("images", _walk_images), ("points3D", _walk_points)):
-        path = folder / f"{name}.bin"
-        data = read_bytes(path)
-        with parsing(path, "whole file of a COLMAP model"):
-            if walk(data) != len(data):
-                raise ValueError("it ends elsewhere than its counts say")
-
-
-def _walk_cameras(data: bytes) -> int:
-    return sum(_CAMERA_HEAD_BYTES + 8 * len(params) for *_, params in cameras_in(data)) + 8
-
-
-def cameras_in(data: bytes) -> Iterator[tuple[int, int, int, int, tuple[float, ...]]]:
-    """Read id, number of the model, width, height and parameters of each camera of a cameras.bin. Raises struct.error
-    and KeyError for damage."""
-    (count,) = struct.unpack_from("<Q", data, 0)
-    at = 8
-    for _ in range(count):
-        head = struct.unpack_from("<IiQQ", data, at)
-        params = struct.unpack_from(f"<{_PARAMETER_COUNTS[head[1]]}d", data, at + _CAMERA_HEAD_BYTES)
-        at += _CAMERA_HEAD_BYTES + 8 * len(params)
-        yield *head, params
-
-
-def _walk_images(data: bytes) -> int:
-    (count,) = struct.unpack_from("<Q", data, 0)
-    at = 8
-    for _ in range(count):
-        at = data.index(b"\0", at + _IMAGE_HEAD_BYTES) + 1
-        (points,) = struct.unpack_from("<Q", data, at)
-        at += 8 + _POINT2D_BYTES * points
-    return at
-
-
-def _walk_points(data: bytes) -> int:
-    (count,) = struct.unpack_from("<Q", data, 0)
-    at = 8
-    for _ in range(count):
-        (track,) = struct.unpack_from("<Q", data, at + _POINT_HEAD_BYTES)
-        at += _POINT_HEAD_BYTES + 8 + _TRACK_ELEMENT_BYTES * track
-    return at
 
 
 @dataclass(frozen=True)

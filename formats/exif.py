@@ -81,11 +81,13 @@ def place_of(tags: _Tags) -> tuple[float, float, float] | None:
     angles = []
     for key, negative in ((ExifTags.GPS.GPSLatitude, "S"), (ExifTags.GPS.GPSLongitude, "W")):
         try:
-            degrees, minutes, seconds = (float(v) for v in tags[key])  # type: ignore[attr-defined]
+            stored = tags[key]  # three numbers by the standard, of which some programs write only one or two
+            parts = stored if isinstance(stored, list | tuple) else (stored,)
+            degrees, minutes, seconds = (*(float(v) for v in parts), 0.0, 0.0)[:3]
         except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
             return None
-        sign = -1 if _text(tags.get(key - 1)).upper().startswith(negative) else 1
-        angles.append(sign * (degrees + minutes / 60 + seconds / 3600))
+        angle = degrees + minutes / 60 + seconds / 3600
+        angles.append(-abs(angle) if _text(tags.get(key - 1)).upper().startswith(negative) else angle)
     latitude, longitude = angles
     # Phones without a fix write zeros.
     if not (abs(latitude) <= 90 and abs(longitude) <= 180) or (latitude == 0 and longitude == 0):

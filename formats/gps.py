@@ -1,9 +1,9 @@
 """Places on the Earth: GPS of images and tracks, and the local east-north-up frame."""
 
-import csv
 import io
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from .errors import InputError
 from .images import exif_gps
+from .names import match_names
 from .reading import parsing, read_bytes
+from .textfile import fields_of
 
 Array = NDArray[np.float64]
 
@@ -33,23 +35,34 @@ _FLATTENING = 1 / 298.257223563
 
 @dataclass(frozen=True)
 class Track:
-    """times (T,) seconds, rising; degrees (T, 2) latitude, longitude; altitude (T,) metres, NaN where untold; how many
-    rows of the file were no fix and are `lost`."""
+    """T fixes: times (T,) seconds, rising; degrees (T, 2) latitude, longitude; altitude (T,) metres, NaN where unknown;
+    how many rows of the file were no fix and are `lost`. Of a table of images: their names (T), and no times (0,)."""
 
     times: Array
     degrees: Array
     altitude: Array
     lost: int = 0
+    names: tuple[str, ...] = ()
 
     def at(self, times: Array, farthest: float) -> Array:
         """Return (N, 3) latitude, longitude, altitude at other times, between fixes; NaN more than `farthest` s from
         one."""
-        values = np.column_stack([self.degrees, self.altitude])
+        around = np.unwrap(self.degrees[:, 1], period=360)  # a track may cross 180 degrees
+        values = np.column_stack([self.degrees[:, 0], around, self.altitude])
         out = np.stack([np.interp(times, self.times, column) for column in values.T], axis=1)
         after = np.clip(np.searchsorted(self.times, times), 0, len(self.times) - 1)
         gap = np.minimum(np.abs(self.times[after] - times), np.abs(self.times[np.maximum(after - 1, 0)] - times))
         out[gap > farthest] = np.nan
+        out[:, 1] -= 360 * np.round(out[:, 1] / 360)
         return np.asarray(out)
+
+    def of(self, names: Sequence[str]) -> Array:
+        """Return (N, 3) latitude, longitude, altitude of images of these names; NaN of those that the table lacks."""
+        out = np.full((len(names), 3), np.nan)
+        for row, found in zip(out, match_names(names, self.names), strict=True):
+            if found is not None:
+                row[:] = *self.degrees[found], self.altitude[found]
+        return out
 
 
 def photo_places(photos: list[Path | None]) -> Array:
@@ -66,38 +79,55 @@ def photo_places(photos: list[Path | None]) -> Array:
 
 
 def read_track(path: Path) -> Track:
-    """Read a GPX track, or a CSV with a header that names time, lat, lon and perhaps alt (seconds, or ISO 8601).
+    """Read a GPX track, the positions in a drone's subtitles, a table with headings that name time, lat, lon and
+    perhaps alt (seconds, or ISO 8601), or one with a row an image: name, lat, lon, or OpenDroneMap's geo.txt.
 
     Rows that are no fix are left out and counted, and of fixes of one time all but one. Raises InputError when the file
     is missing, damaged, of another kind, has fewer than two fixes, or more rows that are none.
     """
     data = read_bytes(path, _MAX_TRACK_BYTES)
     with parsing(path, "GPS track (GPX, or CSV with the columns time, lat, lon)"):
-        is_xml = data[:100].lstrip(_BEFORE_XML).startswith(b"<")
-        texts = list(_gpx_rows(data)) if is_xml else _csv_rows(data.decode("utf-8-sig", errors="replace"))
-        rows = [row for row in map(_fix, texts) if row is not None]
-        lost = len(texts) - len(rows)
-        if len(rows) < 2:
-            raise ValueError(f"it has {len(rows)} fixes with a time, two are needed")
-        if lost > len(rows):
-            raise ValueError(f"{lost} of its {len(texts)} rows are no time with a latitude and longitude")
-        values = np.array(rows, np.float64)
-        values = values[np.unique(values[:, 0], return_index=True)[1]]
-        return Track(values[:, 0], values[:, 1:3], values[:, 3], lost)
+        if data[:100].lstrip(_BEFORE_XML).startswith(b"<"):
+            texts = _gpx_rows(data)
+        else:
+            text = data.decode("utf-8-sig", errors="replace")
+            texts = list(_subtitle_rows(text)) if path.suffix.lower() == ".srt" else _table_rows(text, path)
+    rows = [row for row in map(_fix, texts) if row is not None]
+    lost = len(texts) - len(rows)
+    if len(rows) < 2 or lost > len(rows):
+        raise InputError(
+            f"{path} is no GPS track: of its {len(texts)} rows {len(rows)} are a time or an image's name with a "
+            "latitude and longitude: give the right file"
+        )
+    values = np.array([row[1:] for row in rows], np.float64)
+    if isinstance(rows[0][0], str):
+        return Track(np.zeros(0), values[:, :2], values[:, 2], lost, tuple(str(row[0]) for row in rows))
+    times, first = np.unique(np.array([row[0] for row in rows], np.float64), return_index=True)
+    return Track(times, values[first, :2], values[first, 2], lost)
 
 
-def _fix(row: _Texts) -> tuple[float, float, float, float] | None:
-    """Time, latitude, longitude, altitude; None where the texts are none."""
+def _fix(row: _Texts) -> tuple[float | str, float, float, float] | None:
+    """Time or name, latitude, longitude, altitude; None where the texts are none."""
     try:
-        time, lat, lon = _seconds(row[0] or ""), float(row[1] or ""), float(row[2] or "")
+        when = row[0] if isinstance(row[0], _Name) else _seconds(row[0] or "")
+        lat, lon = float(row[1] or ""), float(row[2] or "")
         altitude = float(row[3]) if row[3] and row[3].strip() else math.nan
     except ValueError:
         return None
-    return (time, lat, lon, altitude) if math.isfinite(time) and abs(lat) <= 90 and abs(lon) <= 180 else None
+    is_known = isinstance(when, str) or math.isfinite(when)
+    return (when, lat, lon, altitude) if is_known and abs(lat) <= 90 and abs(lon) <= 180 else None
 
 
-def _gpx_rows(data: bytes) -> Iterator[_Texts]:
-    """The points of a track that have a time. Entities are bounded by expat, external ones it does not fetch."""
+class _Name(str):
+    """An image's name where other tables have a time."""
+
+    __slots__ = ()
+
+
+def _gpx_rows(data: bytes) -> list[_Texts]:
+    """The points of a track that have a time; without a track its waypoints. Entities are bounded by expat, external
+    ones it does not fetch."""
+    points: dict[str, list[_Texts]] = {"trkpt": [], "rtept": [], "wpt": []}
     above: list[Element] = []
     try:
         for event, element in iterparse(io.BytesIO(data), ("start", "end")):
@@ -107,37 +137,70 @@ def _gpx_rows(data: bytes) -> Iterator[_Texts]:
                     raise ValueError(f"it is nested more than {_DEEPEST} deep")
                 continue
             above.pop()
-            if _bare(element) == "trkpt":
-                told = {_bare(child): (child.text or "").strip() for child in element}
-                if "time" in told:
-                    yield told["time"], element.get("lat"), element.get("lon"), told.get("ele")
-            if above and not any(_bare(outer) == "trkpt" for outer in above):
+            if (kind := _bare(element)) in points:
+                stated = {_bare(child): (child.text or "").strip() for child in element}
+                if "time" in stated:
+                    points[kind].append((stated["time"], element.get("lat"), element.get("lon"), stated.get("ele")))
+            if above and not any(_bare(outer) in points for outer in above):
                 above[-1].clear()  # what has been read is not kept in memory
     except ParseError as error:
         if error.code not in _CUT_SHORT:
             raise
+    return next((rows for rows in points.values() if rows), [])
 
 
 def _bare(element: Element) -> str:
     return element.tag.rpartition("}")[2]
 
 
-def _csv_rows(text: str) -> list[_Texts]:
-    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    separator = max(",;\t", key=lines[0].count) if lines else ","
-    table = csv.DictReader(lines, delimiter=separator)
-    names = {(n or "").strip().lower(): n for n in table.fieldnames or ()}
-    columns = [next((names[n] for n in options if n in names), None) for options in _COLUMNS]
-    if None in columns[:3]:
-        raise ValueError(f"its header is {', '.join(names) or 'empty'}; time, lat and lon are needed")
-    time, lat, lon, height = (c or "" for c in columns)
-    return [(row[time], row[lat], row[lon], row.get(height)) for row in table]
+def _subtitle_rows(text: str) -> Iterator[_Texts]:
+    """Of a drone's subtitles: seconds since the beginning of the video, and what stands in brackets."""
+    time = None
+    for line in text.splitlines():
+        if found := _SHOWN_FROM.match(line):
+            hours, minutes, seconds = (float(part.replace(",", ".")) for part in found.groups())
+            time = str(3600 * hours + 60 * minutes + seconds)
+        stated = {key.lower(): value for key, value in _IN_BRACKETS.findall(line)}
+        if time is not None and "latitude" in stated:
+            height = stated.get("abs_alt", stated.get("altitude"))
+            yield time, stated["latitude"], stated.get("longitude", stated.get("longtitude")), height
+
+
+def _table_rows(text: str, path: Path) -> list[_Texts]:
+    table = fields_of(text, path)
+    name, time, lat, lon, alt = (table.column(*names) for names in _COLUMNS)
+    if lat is None and lon is None and "".join(table.headings).startswith(_SYSTEMS):
+        if "".join(table.headings) not in _DEGREES:
+            raise InputError(
+                f"{path} is no GPS track in degrees: its first line names another system of coordinates: convert it to "
+                "EPSG:4326"
+            )
+        name, lon, lat, alt = 0, 1, 2, 3
+    key = time if name is None else name
+    if key is None or lat is None or lon is None:
+        raise InputError(
+            f"{path} is no GPS track that can be read: its headings are {', '.join(table.headings) or 'missing'}; time "
+            "(or the image's name), lat and lon are needed"
+        )
+
+    def field(row: list[str], column: int | None) -> str | None:
+        return row[column] if column is not None and column < len(row) else None
+
+    kind = str if name is None else _Name
+    return [(kind(field(row, key) or ""), field(row, lat), field(row, lon), field(row, alt)) for row in table.rows]
 
 
 _COLUMNS = (
-    ("time", "timestamp", "seconds", "t"), ("lat", "latitude"), ("lon", "lng", "longitude"),
-    ("alt", "altitude", "ele", "elevation", "height"),
-)  # fmt: skip
+    ("name", "filename", "image", "imagename", "file", "label", "photo", "sourcefile"),
+    ("time", "timestamp", "seconds", "t", "datetime"),
+    ("lat", "latitude", "gpslatitude", "ylatitude"),
+    ("lon", "lng", "long", "longitude", "gpslongitude", "xlongitude"),
+    ("alt", "altitude", "ele", "elevation", "height", "gpsaltitude", "zaltitude"),
+)
+_SYSTEMS, _DEGREES = ("epsg", "wgs84", "proj", "utm"), ("epsg4326", "wgs84")
+"""How OpenDroneMap's geo.txt begins: with the system of its coordinates, east before north."""
+_SHOWN_FROM = re.compile(r"\s*(\d+):(\d+):(\d+[,.]\d+)\s*-->")
+_IN_BRACKETS = re.compile(r"[\[ ](latitude|longt?itude|abs_alt|altitude) ?: ?([-+.\d]+)", re.IGNORECASE)
 
 
 def _seconds(text: str) -> float:

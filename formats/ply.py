@@ -88,7 +88,7 @@ def write_ply(path: Path, elements: dict[str, Rows], comments: list[str]) -> Non
     for name, rows in elements.items():
         header += [f"element {name} {rows.count}", *_property_lines(rows.dtype)]
     with atomic_path(Path(path)) as temporary, temporary.open("wb") as file:
-        file.write("\n".join([*header, "end_header\n"]).encode("ascii", errors="replace"))
+        file.write("\n".join([*header, "end_header\n"]).encode("ascii", errors="backslashreplace"))
         for name, rows in elements.items():
             left = rows.count
             for block in rows.blocks:
@@ -111,8 +111,8 @@ def read_rows(path: Path, elements: dict[str, np.dtype]) -> dict[str, Rows]:
     """
     with opened(path) as file:
         head = file.read(_MAX_HEADER_BYTES)
-    end = head.find(b"end_header\n") + len(b"end_header\n")
-    counts = {m[1].decode(): int(m[2]) for m in re.finditer(rb"element (\w+) (\d+)\n", head[:end])}
+    end = head.find(b"\nend_header\n") + len(b"\nend_header\n")
+    counts = {m[1].decode(): int(m[2]) for m in re.finditer(rb"^element (\w+) (\d+)$", head[:end], re.MULTILINE)}
     rows = {}
     for name, dtype in elements.items():
         rows[name] = Rows(dtype, counts.get(name, 0), _Blocks(path, dtype, counts.get(name, 0), end))
@@ -177,7 +177,8 @@ def columns(vertex: NDArray[Any], names: list[str], path: Path) -> NDArray[np.fl
 
 def _require_whole(path: Path, head: bytes) -> None:
     """Compare the counts in the header with the size of the file, before anyone allocates for them."""
-    end = head.find(b"end_header")
+    found = re.search(rb"[\r\n]end_header", head)
+    end = found.start() + 1 if found else -1
     if end < 0:
         raise InputError(f"{path} has no PLY header end: it is damaged, copy or export it again")
     available = Path(path).stat().st_size - end

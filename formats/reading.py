@@ -3,7 +3,6 @@
 import errno
 import hashlib
 import os
-import posixpath
 import stat
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -11,6 +10,7 @@ from io import BufferedReader
 from pathlib import Path
 
 from .errors import InputError
+from .names import folded, path_parts
 
 _LONGEST_NAME, _LONGEST_PATH = 255, 4000
 """Bytes that Linux takes for a part of a path, and a little less than it takes for the whole."""
@@ -18,6 +18,10 @@ _LONGEST_NAME, _LONGEST_PATH = 255, 4000
 _LFS_POINTER = b"version https://git-lfs"
 _MAX_REASON_CHARACTERS = 200
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+Listed = dict[Path, dict[str, list[str]]]
+"""What is in folders, by its `folded` names."""
 
 
 @contextmanager
@@ -165,21 +169,42 @@ def resolve_within(root: Path, relative: str, named_by: Path) -> Path:
     return root / name
 
 
-def named_file(places: Sequence[Path], name: str, named_by: Path, shorten: bool = True) -> Path | None:
+def named_file(
+    places: Sequence[Path], name: str, named_by: Path, shorten: bool = True, listed: Listed | None = None
+) -> Path | None:
     """Return the file in one of `places` with the path `name`, or its longest end that is there; None without even one
     of the bare name.
 
-    For names written on another machine: absolute, with backslashes, or seen from another folder. What is returned
-    lies in one of `places`, whatever the name. Without `shorten` only roots and leading `..` are left off. Raises
-    InputError for a name too long.
+    For names written on another machine: absolute, with backslashes, seen from another folder, in another Unicode
+    normal form, or in another case where one file only fits. What is returned lies in one of `places`, whatever the
+    name. Without `shorten` only roots and leading `..` are left off. `listed` keeps the folders' contents from one call
+    to the next. Raises InputError for a name too long.
     """
-    parts = posixpath.normpath(name.replace("\\", "/")).split("/")
-    parts = [part for part in parts if part not in ("", ".", "..") and not part.endswith(":")]
+    listed, parts = {} if listed is None else listed, path_parts(name)
     for first in range(len(parts) if shorten else min(len(parts), 1)):
-        files = (resolve_within(place, "/".join(parts[first:]), named_by) for place in places)
+        files = [resolve_within(place, "/".join(parts[first:]), named_by) for place in places]
         if found := next((file for file in files if file.is_file()), None):
             return found
+        alike = (_spelled(place, parts[first:], listed) for place in places)
+        if found := next((file for file in alike if file is not None), None):
+            return found
     return None
+
+
+def _spelled(folder: Path, parts: Sequence[str], listed: Listed) -> Path | None:
+    """The only file below a folder whose path differs in case and normal form alone."""
+    for part in parts:
+        if folder not in listed:
+            inside: dict[str, list[str]] = {}
+            for entry in os.listdir(folder) if folder.is_dir() else ():
+                inside.setdefault(folded(entry), []).append(entry)
+            listed[folder] = inside
+        found = listed[folder].get(folded(part), [])
+        exact = [entry for entry in found if entry == part] or found
+        if len(exact) != 1:
+            return None
+        folder = folder / exact[0]
+    return folder if folder.is_file() else None
 
 
 def file_sha256(path: Path) -> str:

@@ -1,12 +1,16 @@
 """Text files: rows of numbers, JSON and TOML, read with a limit and with the place of an error."""
 
 import codecs
+import csv
+import io
 import json
 import math
 import re
 import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
+from xml.etree.ElementTree import Element, iterparse
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,16 +21,24 @@ from .reading import parsing, read_bytes
 
 MAX_JSON_BYTES = 32 * 1024 * 1024
 MAX_TOML_BYTES = 1024 * 1024
+MAX_XML_BYTES = 16 * 1024 * 1024
+_DEEPEST_XML = 64
 _MAX_DIGITS = 40
 _DEEPEST_KEY, _KEY_ENDS = 64, re.compile(r"[=\n,\[{]")
-_NO_KEY = re.compile(r"""#[^\n]*|\"{3}(?:[^\\]|\\.)*?\"{3}|'{3}.*?'{3}|"(?:[^"\\\n]|\\.)*"|'[^'\n]*'""", re.DOTALL)
-"""A comment or a string of TOML: dots in it divide no key."""
+_NO_KEY = re.compile(
+    r"""#[^\n]*|\"{3}(?:[^\\]|\\.)*?(?:\"{3}|\Z)|'{3}.*?(?:'{3}|\Z)|"(?:[^"\\\n]|\\.)*"?|'[^'\n]*'?""", re.DOTALL
+)
+"""A comment or a string of TOML: dots in it divide no key. One that does not end goes as far as it can, because looking
+for its end again from each quote takes the square of the length."""
 _HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
 
 MAX_TEXT_BYTES = 48 * 1024 * 1024
 """150,000 poses of 16 numbers with all their digits. Taken apart into words, text needs twenty times its size."""
 
 _COMMENT = re.compile(r"^\s*//|(?:^|\s)#")
+_DIVIDERS = (";", "\t", ",")
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
+_PUNCTUATION = re.compile(r"[^a-z0-9]")
 
 
 def read_text(path: Path, limit: int | None = MAX_TEXT_BYTES) -> str:
@@ -42,16 +54,75 @@ def read_text(path: Path, limit: int | None = MAX_TEXT_BYTES) -> str:
     return text
 
 
-def read_rows(path: Path) -> list[list[str]]:
-    """Read the fields of each line, split at blanks and commas; empty lines, comments and a line of headings are left
-    out.
+@dataclass(frozen=True)
+class Fields:
+    """Rows of a text table, and its headings in lower case without units and punctuation; () where it has none."""
 
-    A comment begins with # or // at the start of a line, or with # after a blank; headings are a first line without
-    a number.
+    headings: tuple[str, ...]
+    rows: list[list[str]]
+
+    def column(self, *names: str) -> int | None:
+        """Return the number of the column that has one of these headings; None without any."""
+        return next((self.headings.index(name) for name in names if name in self.headings), None)
+
+
+def read_fields(path: Path) -> Fields:
+    """Read the fields of a text table, whatever divides them: semicolons, tabs, commas or blanks, by the first line of
+    data; then commas may be those of decimal numbers.
+
+    Empty lines and comments are left out. A comment begins with # or // at the start of a line, or with # after a
+    blank. Headings are a first line without a number, or the last comment before the data if it has as many fields.
+    Raises InputError as `read_text`, and for fields of quotes that do not end.
     """
-    lines = (_COMMENT.split(line, 1)[0].replace(",", " ").split() for line in read_text(path).splitlines())
-    rows = [line for line in lines if line]
-    return rows[1:] if len(rows) > 1 and not any(map(is_number, rows[0])) else rows
+    return fields_of(read_text(path), path)
+
+
+def fields_of(text: str, path: Path) -> Fields:
+    """Read the fields of a table as `read_fields` does; `path` is for errors."""
+    data: list[str] = []
+    said = ""
+    for line in text.splitlines():
+        content = _COMMENT.split(line, maxsplit=1)[0].strip()
+        if content:
+            data.append(content)
+        elif not data and line.strip():
+            said = line.strip().lstrip("#/ \t")
+    beside = data[min(1, len(data) - 1)] if data else ""  # the first may state a projection, or headings
+    divider = next((mark for mark in _DIVIDERS if mark in beside), None)
+    with parsing(path, "table"):
+        rows = [row for row in (_divided(line, divider) for line in data) if row]
+        names = _divided(said, divider)
+    if len(rows) > 1 and not any(map(is_number, rows[0])):
+        names, rows = rows[0], rows[1:]
+    elif not rows or len(names) != len(rows[0]) or any(map(is_number, names)):
+        names = []
+    return Fields(tuple(map(_heading, names)), rows)
+
+
+def _divided(line: str, divider: str | None) -> list[str]:
+    if divider is None or divider not in line:
+        return line.split()
+    fields = next(csv.reader([line], delimiter=divider, skipinitialspace=True)) if '"' in line else line.split(divider)
+    fields = [field.strip() if divider == "," else _plain_number(field.strip()) for field in fields]
+    while fields and not fields[-1]:
+        fields.pop()
+    words = [field.split() for field in fields]
+    # Blanks may divide as well: 1 0 0, 0 1 0.
+    mixed = any(len(part) > 1 and all(map(is_number, part)) for part in words)
+    return [word for part in words for word in part] if mixed else fields
+
+
+def _plain_number(field: str) -> str:
+    return field.replace(",", ".") if _DECIMAL_COMMA.fullmatch(field) else field
+
+
+def _heading(text: str) -> str:
+    return _PUNCTUATION.sub("", text.partition("[")[0].partition("(")[0].lower())
+
+
+def read_rows(path: Path) -> list[list[str]]:
+    """Read the rows of a text table as `read_fields` does."""
+    return read_fields(path).rows
 
 
 def is_number(field: str) -> bool:
@@ -119,6 +190,23 @@ def read_toml(path: Path) -> dict[str, Any]:
         if any(part.count(".") > _DEEPEST_KEY for part in _KEY_ENDS.split(_NO_KEY.sub("", text))):
             raise ValueError("a key of too many parts")  # tomllib takes the square of their number in time
         return tomllib.loads(text)
+
+
+def read_xml(path: Path, limit: int = MAX_XML_BYTES) -> Element:
+    """Read the root element of an XML file. Entities are bounded by expat, external ones it does not fetch.
+
+    Raises InputError when the file is missing, larger than `limit` bytes, damaged or nested too deep.
+    """
+    data, depth, root = read_bytes(path, limit), 0, None
+    with parsing(path, "valid XML"):
+        for event, element in iterparse(io.BytesIO(data), ("start", "end")):
+            root = element if root is None else root
+            depth += 1 if event == "start" else -1
+            if depth > _DEEPEST_XML:
+                raise ValueError(f"it is nested more than {_DEEPEST_XML} deep")
+    if root is None:
+        raise InputError(f"{path} holds no XML: export it again")
+    return root
 
 
 def _refuse(word: str) -> NoReturn:

@@ -1,5 +1,6 @@
 """Trajectories as text: TUM lines and 4x4 matrices."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -7,12 +8,18 @@ from numpy.typing import NDArray
 
 from .atomic import write_text
 from .errors import InputError
-from .textfile import read_rows, read_table
+from .textfile import Fields, read_fields, read_rows, read_table
 
 _ROTATION_TOLERANCE = 0.05
 """Largest departure of R^T R from the identity that is taken for rounding or drift rather than for another format."""
 
 _LARGEST_ENTRY = 2.0
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_BEFORE_AXIS = ("", "t", "p", "pos", "position", "poseposition", "translation", "prsr")
+_BEFORE_TURN = ("q", "rot", "quat", "orientation", "poseorientation", "rotation", "qrs")
+_TIME, _NAME = ("timestamp", "time", "t", "seconds"), ("name", "filename", "image", "imagename", "file", "label")
+_COUNT = ("frame", "frameid", "framenumber")
+_LARGEST_COUNT = 1e12
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes x right, y down, z forward from those of graphics (y up, z backward); its own inverse."""
@@ -92,21 +99,107 @@ def _is_within_reach(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray((np.abs(positions) <= FARTHEST).all(axis=1))
 
 
+@dataclass(frozen=True)
+class Trajectory:
+    """N poses of a text file: world_from_cam (N, 4, 4), NaN for rows without one; times (N,) in seconds and names (N)
+    of their images, None and () where the file has none; `is_counted`: the names are numbers of frames."""
+
+    world_from_cam: NDArray[np.float64]
+    times: NDArray[np.float64] | None = None
+    names: tuple[str, ...] = ()
+    is_counted: bool = False
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read the poses of a text table: by its headings where they name position and quaternion, else TUM lines (with
+    RTAB-Map's ninth column, the node's id, or without), or matrices as `read_matrices` does.
+
+    Raises InputError for anything else, a pose that is no rigid transform, and angles in place of a rotation.
+    """
+    table = read_fields(path)
+    if not table.rows:
+        raise InputError(f"{path} holds no numbers: check that it was written completely")
+    width, chosen = len(table.rows[0]), _chosen_columns(table, path)
+    if chosen is None and width not in (8, 9):
+        return Trajectory(read_matrices(path))
+    columns = chosen or list(range(1, 8))
+    if chosen is None:
+        _require_tum(table.rows, path)
+    values = _numbers(table.rows, columns, path)
+    poses = poses_from_quaternions(values[:, 3:], values[:, :3], str(path))
+    if (named := table.column(*_NAME)) is not None:
+        return Trajectory(poses, names=tuple(row[named] for row in table.rows))
+    if (counted := table.column(*_COUNT)) is not None:
+        numbers = _numbers(table.rows, [counted], path)[:, 0]
+        poses[~(np.abs(numbers) < _LARGEST_COUNT)] = np.nan
+        names = tuple(f"{int(n):06d}" if abs(n) < _LARGEST_COUNT else f"row {k + 1}" for k, n in enumerate(numbers))
+        return Trajectory(poses, names=names, is_counted=True)
+    timed = table.column(*_TIME) if chosen else 0
+    if timed is None:
+        return Trajectory(poses)
+    times = _in_seconds(_numbers(table.rows, [timed], path)[:, 0])
+    poses[~np.isfinite(times)] = np.nan
+    return Trajectory(poses, times)
+
+
+def _chosen_columns(table: Fields, path: Path) -> list[int] | None:
+    """The columns of x, y, z, qx, qy, qz, qw by their headings; None where these name neither."""
+    found = [table.column(*(f"{before}{axis}" for before in _BEFORE_AXIS)) for axis in "xyz"]
+    found += [table.column(*(f"{before}{axis}" for before in _BEFORE_TURN)) for axis in "xyzw"]
+    missing = [name for name, column in zip(_POSE, found, strict=True) if column is None]
+    if missing and table.column("heading", "yaw", "omega") is not None and table.column("pitch", "phi") is not None:
+        raise InputError(
+            f"{path} states rotations as angles ({', '.join(table.headings[:8])}, ...), as RealityScan and Metashape "
+            "write them, each in another order: export the cameras there in COLMAP's format and give its folder"
+        )
+    if len(missing) > 3 and len(table.rows[0]) in (4, 8, 9, 12, 16):
+        return None
+    if missing and table.headings:
+        raise InputError(f"{path}: no column {missing[0]}: a table of poses has {', '.join(_POSE)}")
+    return None if missing else [column for column in found if column is not None]
+
+
+def _require_tum(rows: list[list[str]], path: Path) -> None:
+    for i, row in enumerate(rows):
+        if len(row) not in (8, 9) or (len(row) == 9 and not row[8].isdecimal()):
+            raise InputError(f"{path}: row {i + 1} has {len(row)} numbers, a TUM trajectory has 8 (t, xyz, quat xyzw)")
+
+
+def _numbers(rows: list[list[str]], columns: list[int], path: Path) -> NDArray[np.float64]:
+    """(N, len(columns)) of these columns. Raises InputError naming the row that lacks one."""
+    for i, row in enumerate(rows):
+        if len(row) <= max(columns):
+            raise InputError(
+                f"{path}: row {i + 1} has {len(row)} numbers, expected {max(columns) + 1}: is the file cut short?"
+            )
+    try:
+        return np.array([[row[c] for c in columns] for row in rows], np.float64).reshape(len(rows), len(columns))
+    except ValueError as error:
+        raise InputError(f"{path}: {str(error)[:200]}: every field must be a number") from error
+
+
+def _in_seconds(times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Times that count milli-, micro- or nanoseconds since 1970, by their size."""
+    largest = np.abs(times[np.isfinite(times)]).max(initial=0)
+    unit = next((unit for unit, least in ((1e-9, 1e17), (1e-6, 1e14), (1e-3, 1e11)) if largest > least), 1.0)
+    return times * unit
+
+
 def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Read (N,) timestamps in file order and (N, 4, 4) world_from_cam of a TUM file, without rows that are not finite.
 
     Raises InputError for a row of other than 8 numbers, a pose that is none, or where most rows are not finite.
     """
-    rows = read_rows(path)
-    for i, row in enumerate(rows):
-        if len(row) != 8:
-            raise InputError(f"{path}: row {i + 1} has {len(row)} numbers, a TUM trajectory has 8 (t, xyz, quat xyzw)")
-    table = read_table(path, 8)
-    poses = poses_from_quaternions(table[:, 4:], table[:, 1:4], str(path))
-    known = np.isfinite(table[:, 0]) & np.isfinite(poses).all(axis=(1, 2))
+    found = read_trajectory(path)
+    if found.times is None:
+        raise InputError(f"{path} is no TUM trajectory, which has 8 numbers a row (t, xyz, quat xyzw)")
+    known = np.asarray(np.isfinite(found.world_from_cam).all(axis=(1, 2)))
     if 2 * known.sum() < len(known):
-        raise _no_pose(table[:, 4:], table[:, 1:4], int(np.argmin(known)), str(path))
-    return table[known, 0], poses[known]
+        raise InputError(
+            f"{path}: pose {int(np.argmin(known)) + 1} is no rigid transform (not finite, or a quaternion of length "
+            "0), and so are most: export it again"
+        )
+    return found.times[known], found.world_from_cam[known]
 
 
 def read_matrices(path: Path) -> NDArray[np.float64]:

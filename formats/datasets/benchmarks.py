@@ -9,6 +9,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +17,9 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..image_folder import frame_number, list_images
 from ..images import first_readable, image_size
-from ..textfile import read_table, read_text
+from ..textfile import is_number, read_table
 from ..trajectory import clean_poses, poses_from_quaternions, read_matrices, read_tum
-from .calibration import read_intrinsics_json
+from .calibration import read_intrinsics_json, read_yaml
 from .matching import (
     SAME_INSTANT_SECONDS,
     SENSOR_RATE,
@@ -146,7 +147,8 @@ def open_euroc(path: Path) -> Sequence:
     times, images = _euroc_images(root / "cam0")
     camera, body_from_cam = _euroc_calibration(root / "cam0" / "sensor.yaml")
     poses = _euroc_poses(root / "state_groundtruth_estimate0" / "data.csv", times, body_from_cam)
-    return sequence_of("euroc", path, images, timestamps=times, camera=camera, world_from_cam=poses)
+    notes = ("the right camera, cam1/, is not read",) if (root / "cam1").is_dir() else ()
+    return sequence_of("euroc", path, images, timestamps=times, camera=camera, world_from_cam=poses, notes=notes)
 
 
 def _euroc_images(cam: Path) -> tuple[NDArray[np.float64], list[Path]]:
@@ -166,24 +168,22 @@ def _euroc_poses(
 
 
 def _euroc_calibration(path: Path) -> tuple[Camera, NDArray[np.float64]]:
-    text = read_text(path)
-    fx, fy, cx, cy = _yaml_numbers(text, path, "intrinsics", 4)
-    width, height = _yaml_numbers(text, path, "resolution", 2)
-    distortion = _yaml_numbers(text, path, "distortion_coefficients", 4)
-    transform = np.array(_yaml_numbers(text, path, "data", 16)).reshape(1, 4, 4)
+    table = read_yaml(path)
+    fx, fy, cx, cy = _listed(table, path, "intrinsics", 4)
+    width, height = _listed(table, path, "resolution", 2)
+    distortion = _listed(table, path, "distortion_coefficients", 4)
+    inner = table.get("T_BS")
+    transform = np.array(_listed(inner if isinstance(inner, dict) else {}, path, "data", 16)).reshape(1, 4, 4)
     if not np.isfinite([width, height, *transform.ravel()]).all():
         raise InputError(f"{path}: a number is not finite: unpack the data set again")
     camera = Camera.from_integer_centres(int(width), int(height), fx, fy, cx, cy, tuple(distortion))
     return camera, clean_poses(transform, str(path))[0]
 
 
-def _yaml_numbers(text: str, path: Path, key: str, count: int) -> list[float]:
-    """The list under a key of the YAML file, which may go over several lines."""
-    found = re.search(rf"^\s*{key}\s*:\s*\[([^\]]*)\]", text, flags=re.MULTILINE)
-    try:
-        values = [float(part) for part in found[1].split(",")] if found else []
-    except ValueError:
-        values = []
+def _listed(table: dict[str, Any], path: Path, key: str, count: int) -> list[float]:
+    """The numbers under a key; YAML calls 1e-5 a text."""
+    found = table.get(key)
+    values = [float(v) for v in found if is_number(str(v))] if isinstance(found, list) else []
     if len(values) != count:
         raise InputError(f"{path}: {key!r} is missing or not a list of {count} numbers: unpack the data set again")
     return values

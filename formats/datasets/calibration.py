@@ -1,26 +1,33 @@
 """Intrinsics in files of data sets and of other programs: our own JSON; ROS, Kalibr, EuRoC and ORB-SLAM (YAML),
-OpenCV (YAML, XML), ARKit, Open3D and RealSense (JSON), COLMAP (text, binary), KITTI and Middlebury (text)."""
+OpenCV (YAML, XML), ARKit, Open3D, RealSense, Record3D, OpenDroneMap and Meshroom (JSON), Metashape (XML), COLMAP (text,
+binary), KITTI and Middlebury (text)."""
 
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element
 
-from ..colmap import cameras_in
+import numpy as np
+
+from ..colmap import Array
+from ..colmap_files import cameras_in
 from ..errors import InputError
 from ..reading import parsing, read_bytes
-from ..textfile import number, optional_number, read_json, read_json_object, read_rows, read_text
+from ..textfile import is_number, number, optional_number, read_json, read_json_object, read_rows, read_text, read_xml
 from .colmap import camera_from_colmap
 from .sequence import Camera, distortion_names
 
 FORMATS = (
     "JSON (fx, fy, cx, cy, width, height, distortion; or as of ARKit, Open3D, nerfstudio), YAML of ROS, Kalibr, EuRoC "
-    "or ORB-SLAM, OpenCV's YAML or XML, COLMAP's cameras.txt or cameras.bin, KITTI's calib.txt, a 3x3 matrix as text"
+    "or ORB-SLAM, OpenCV's YAML or XML, Metashape's XML, Meshroom's cameras.sfm, OpenDroneMap's cameras.json, COLMAP's "
+    "cameras.txt or cameras.bin, KITTI's calib.txt, a 3x3 matrix as text"
 )
 _MATRIX = ("camera_matrix", "cameramatrix", "k", "intrinsic_matrix", "intrinsicmatrix", "cameraintrinsics",
            "intrinsics", "intrinsic", "mtx")  # fmt: skip
 _DISTORTION = ("distortion_coefficients", "distortion_coeffs", "distcoeffs", "dist_coeffs", "dist_coeff", "distortion",
                "coeffs", "dist", "d")  # fmt: skip
-_SAYS_DISTORTION = re.compile(r"^(xi|alpha|beta|d\d*)$|dist(?!ance)|coeff|radial|tangential")
+_SAYS_DISTORTION = re.compile(r"^(xi|alpha|beta|d\d*)$|dist(?!ance)|(?<!intrinsic)coeff|radial|tangential")
 _MODEL = ("distortion_model", "camera_model", "camera_type", "model_type", "type", "model")
 _PERSPECTIVE = ("", "none", "opencv", "full_opencv", "perspective", "pinhole", "plumb_bob", "radtan",
                 "radial-tangential", "rational_polynomial", "simple_pinhole", "rectified", "camera")  # fmt: skip
@@ -30,6 +37,8 @@ _SIDES = (("width", "w", "image_width", "imagewidth"), ("height", "h", "image_he
 _SIZE = ("resolution", "image_size", "imagesize", "size")
 _KITTI = re.compile(r"^(P|K|cam|[PK]_|P_rect_)\d*$")
 _MAX_DEPTH, _MAX_BYTES, _MAX_CAMERAS = 8, 2_000_000, 1000
+_MAX_YAML = 256_000
+"""Characters, with room for the corners that OpenCV adds; the YAML reader takes two seconds for so many."""
 
 
 def read_calibration_file(path: Path, size: tuple[int, int]) -> dict[str, Camera]:
@@ -53,14 +62,29 @@ def read_calibration_file(path: Path, size: tuple[int, int]) -> dict[str, Camera
 
 def _tables(path: Path, suffix: str) -> Any:
     """What a file of JSON, YAML, XML or of KITTI's lines holds, as lists and dicts."""
-    if suffix == ".json":
+    if suffix in (".json", ".sfm"):
         return read_json(path)
     text = read_text(path)
-    return _of_xml(text) if text.lstrip().startswith("<") else _of_kitti(text) or _of_yaml(text)
+    if text.lstrip().startswith("<"):
+        return _plain(read_xml(path, _MAX_BYTES))
+    return _of_kitti(text) or _of_yaml(text)
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read the table in a YAML file, as OpenCV, ROS or EuRoC write it. Raises InputError for anything else."""
+    text = read_text(path, _MAX_BYTES)
+    with parsing(path, "YAML file", "unpack or export it again"):
+        table = _of_yaml(text)
+    if not isinstance(table, dict):
+        raise InputError(f"{path} holds no table of keys and values: unpack or export it again")
+    return table
 
 
 def _of_yaml(text: str) -> Any:
     import yaml
+
+    if len(text) > _MAX_YAML:
+        raise ValueError(f"of {len(text):,} characters, more than a calibration has")
 
     class Loader(yaml.SafeLoader):
         """Reads a table with a tag, as OpenCV's matrices are, like any other; no aliases, which multiply."""
@@ -75,33 +99,45 @@ def _of_yaml(text: str) -> Any:
     return next(iter(yaml.load_all(re.sub(r"\A\s*%YAML[^\n]*\n", "", text), Loader)), None)
 
 
-def _of_xml(text: str) -> Any:
-    import cv2
+def _plain(element: Element) -> Any:
+    """Lists, dicts and numbers of XML as OpenCV writes it (`_` for each of a list, numbers between blanks), and
+    Metashape, whose sizes are attributes."""
+    if not len(element) and not element.attrib:
+        return _number_or_text(element.text or "")
+    if len(element) and all(child.tag == "_" for child in element):
+        return [_plain(child) for child in element]
+    found = {key: _number_or_text(text) for key, text in element.attrib.items()}
+    counts = Counter[str]()
+    for child in element:
+        counts[child.tag] += 1
+        found[child.tag if counts[child.tag] == 1 else f"{child.tag} {counts[child.tag]}"] = _plain(child)
+    return found if len(element) or not (element.text or "").strip() else _number_or_text(element.text or "")
 
-    def plain(node: Any) -> Any:
-        if node.isMap():
-            return {key: plain(node.getNode(key)) for key in node.keys()}  # noqa: SIM118, a node is no dict
-        if node.isSeq():
-            return [plain(node.at(i)) for i in range(node.size())]
-        return node.string() if node.isString() else node.real()
 
-    file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-    try:
-        return plain(file.root())
-    finally:
-        file.release()
+def _number_or_text(text: str) -> Any:
+    words = text.split()
+    if not words or not all(map(is_number, words)):
+        return text.strip().strip('"')
+    numbers = [float(word) for word in words]
+    return numbers[0] if len(numbers) == 1 else numbers
 
 
 def _of_kitti(text: str) -> dict[str, Any]:
     """A table for each camera of lines `P0: 12 numbers`, or `K_00: 9 numbers` beside D_00 and S_00, or `cam0=[a b c;
     ...]` beside width and height."""
-    lines = re.findall(r"^\s*(\w+)\s*[:=]\s*\[?([-+\d.eE\s,;]+?)\]?\s*$", text, re.MULTILINE)
-    found = {name: [float(word) for word in re.split(r"[\s,;]+", numbers) if word] for name, numbers in lines}
-    sides = {side: found[side][0] for side in ("width", "height") if side in found}
-    cameras = {}
+    found: dict[str, list[float]] = {}
+    for line in text.splitlines():
+        name, _, numbers = line.replace("=", ":", 1).partition(":")
+        words = numbers.strip().removeprefix("[").removesuffix("]").replace(",", " ").replace(";", " ").split()
+        if words and all(map(is_number, words)):
+            found[name.strip()] = [float(word) for word in words]
+    sides: dict[str, Any] = {side: found[side][0] for side in ("width", "height") if side in found}
+    cameras: dict[str, Any] = {}
     for key in (key for key in found if _KITTI.match(key)):
         size = found.get("S" + key[1:])
-        lens = {"d": found[key.replace("K", "D")]} if key.startswith("K") and key.replace("K", "D") in found else {}
+        lens: dict[str, Any] = (
+            {"d": found[key.replace("K", "D")]} if key.startswith("K") and key.replace("K", "D") in found else {}
+        )
         cameras[key] = {"k": found[key], **sides, **lens, **({"size": size} if size else {})}
     return cameras
 
@@ -133,6 +169,12 @@ def _collect(value: Any, name: str, found: dict[str, Camera], path: Path, size: 
     for inner in [table.get(key) for key in (*_MATRIX, *_DISTORTION, *_PARTS)]:
         table |= inner if isinstance(inner, dict) and "data" not in inner else {}
     matrix = next((k for key in _MATRIX if (k := _matrix(_numbers(table.get(key)) or [])) is not None), None)
+    if matrix is None and (rows := _rows_of_four(table.get("perframeintrinsiccoeffs"))) is not None:
+        matrix = np.median(rows, axis=0).tolist()  # Record3D's, which change with the focus
+    translated = next((camera for of in _PROGRAMS if (camera := of(table, path)) is not None), None)
+    if translated is not None:
+        found[name or "camera"] = translated
+        return
     if matrix is not None or _first(table, ("fx", "fl_x")) is not None:
         found[name or "camera"] = _camera(table, matrix, path, size)
         return
@@ -161,6 +203,72 @@ def _camera(table: dict[str, Any], matrix: list[float] | None, path: Path, size:
     return camera_from_table(plain, path, integer_centres=matrix is not None or path.suffix.lower() != ".json")
 
 
+def _of_metashape(table: dict[str, Any], path: Path) -> Camera | None:
+    """One focal length, the principal point seen from the middle of the image; p1 and p2 the other way round than
+    OpenCV's. The first pixel's centre is at (0.5, 0.5)."""
+    size = table.get("resolution")
+    if not (isinstance(size, dict) or "projection" in table) or table.get("class") == "initial":
+        return None
+    table = {**size, **table} if isinstance(size, dict) else table
+    if not {"f", "width", "height"} <= table.keys():
+        return None
+    kind = str(table.get("projection", table.get("type", "frame")))
+    f, w, h = (number(table, path, key) for key in ("f", "width", "height"))
+    cx, cy, k1, k2, k3, k4, p1, p2, b1, b2 = (
+        optional_number(table, path, key) or 0.0 for key in ("cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "b1", "b2")
+    )
+    if kind != "frame" or k4 or b2:
+        what = f"projection {kind!r}" if kind != "frame" else "k4" if k4 else "b2"
+        raise InputError(f"{path}: Metashape's {what} is not supported here: undistort the images there")
+    return Camera(int(w), int(h), f + b1, f, w / 2 + cx, h / 2 + cy, _trimmed([k1, k2, p2, p1, k3]))
+
+
+def _of_opendronemap(table: dict[str, Any], path: Path) -> Camera | None:
+    """Lengths are fractions of the longer side, the principal point seen from the middle of the image."""
+    kind = str(table.get("projection_type", "")).lower()
+    if not kind or not {"width", "height"} <= table.keys():
+        return None
+    if kind not in ("perspective", "brown", "simple_radial", "radial", "fisheye_opencv"):
+        raise InputError(f"{path}: OpenDroneMap's lens {kind!r} is not supported: undistort the images first")
+    w, h = number(table, path, "width"), number(table, path, "height")
+    fx = number(table, path, "focal_x", "focal")
+    fy = optional_number(table, path, "focal_y") or fx
+    cx, cy = (optional_number(table, path, key) or 0.0 for key in ("c_x", "c_y"))
+    names = distortion_names(kind.startswith("fisheye"))[:5]
+    lens = tuple(optional_number(table, path, name) or 0.0 for name in names)
+    side = max(w, h)
+    return Camera(
+        int(w), int(h), fx * side, fy * side, w / 2 + cx * side, h / 2 + cy * side,
+        lens if kind.startswith("fisheye") else _trimmed(list(lens)), kind.startswith("fisheye"),
+    )  # fmt: skip
+
+
+def _of_meshroom(table: dict[str, Any], path: Path) -> Camera | None:
+    """All numbers are texts; the focal length is in millimetres of the sensor, the principal point in pixels seen from
+    the middle of the image."""
+    if not {"focallength", "sensorwidth", "width", "height"} <= table.keys():
+        return None
+    kind = str(table.get("type", table.get("distortiontype", ""))).lower()
+    kind = kind if kind != "pinhole" else str(table.get("distortiontype", "")).lower().replace("none", "") or kind
+    given = [float(v) for v in table.get("distortionparams") or ()]
+    k = [*given, 0.0, 0.0, 0.0, 0.0, 0.0]
+    lens = {
+        "pinhole": [], "radial1": [k[0]], "radialk1": [k[0]], "radial3": [k[0], k[1], 0.0, 0.0, k[2]],
+        "radialk3": [k[0], k[1], 0.0, 0.0, k[2]], "brown": [k[0], k[1], k[3], k[4], k[2]],
+    }.get(kind)  # fmt: skip
+    if lens is None:
+        raise InputError(f"{path}: Meshroom's lens {kind!r} is not supported: export the undistorted images")
+    w, h, mm, sensor = (float(table[key]) for key in ("width", "height", "focallength", "sensorwidth"))
+    ratio = float(table.get("pixelratio") or 1)
+    x, y = (float(v) for v in table.get("principalpoint") or (0, 0))
+    f = mm / sensor * w
+    return Camera(int(w), int(h), f, f / ratio, w / 2 + x, h / 2 + y, _trimmed(lens))
+
+
+_PROGRAMS = (_of_metashape, _of_opendronemap, _of_meshroom)
+"""Cameras of programs that count otherwise than OpenCV: from a table with keys in small letters; None for another's."""
+
+
 def _matrix(numbers: list[float]) -> list[float] | None:
     """fx, fy, cx, cy of four numbers, or of a calibration matrix without skew, of 9, 12 or 16 numbers by rows or
     columns."""
@@ -173,6 +281,12 @@ def _matrix(numbers: list[float]) -> list[float] | None:
     k = k if k[0][2] or k[1][2] else [list(column) for column in zip(*k, strict=True)]
     is_one = not any((k[0][1], k[1][0], k[2][0], k[2][1])) and k[2][2] == 1 and min(k[0][0], k[1][1]) > 0
     return [k[0][0], k[1][1], k[0][2], k[1][2]] if is_one else None
+
+
+def _rows_of_four(value: Any) -> Array | None:
+    rows = value if isinstance(value, list) else []
+    is_so = rows and all(isinstance(r, list) and len(r) == 4 and _numbers(r) is not None for r in rows)
+    return np.array(rows, np.float64) if is_so else None
 
 
 def _first(table: dict[str, Any], keys: tuple[str, ...]) -> Any:

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..image_folder import count_images, list_images, read_image_times
-from ..textfile import read_rows
-from ..trajectory import read_matrices, read_tum
+from ..names import match_names
+from ..trajectory import read_trajectory
 from .calibration import read_intrinsics_json
 from .matching import classes_found, files_for_images, poses_at, poses_for_images, sequence_of
 from .sequence import Camera, LabelClass, Sequence, known_classes
@@ -107,15 +107,17 @@ def _poses(
     path = next((root / name for name in _POSE_FILES if (root / name).is_file()), None)
     if path is None:
         return None, ()
-    rows = read_rows(path)
-    if not rows or len(rows[0]) != 8:
-        return poses_for_images(images, read_matrices(path), path), ()
-    pose_times, poses = read_tum(path)
+    found = read_trajectory(path)
+    if found.names:
+        rows = match_names([str(image) for image in images], found.names)
+        return np.stack([np.full((4, 4), np.nan) if k is None else found.world_from_cam[k] for k in rows]), ()
+    if found.times is None:
+        return poses_for_images(images, found.world_from_cam, path), ()
     if times is not None:
-        return poses_at(times, pose_times, poses), ()
-    if len(poses) == len(images):
-        return poses, ()
-    why = f"the {len(poses)} poses of {path.name} belong to times, and the {len(images)} images state none"
+        return poses_at(times, found.times, found.world_from_cam), ()
+    if len(found.times) == len(images):
+        return found.world_from_cam, ()
+    why = f"the {len(found.times)} poses of {path.name} belong to times, and the {len(images)} images state none"
     return None, (f"{why}: the poses are not used; timestamps.txt with a line for each image would tell",)
 
 

@@ -1,8 +1,9 @@
 """Which depth map, label image or pose row belongs to which colour image."""
 
 import itertools
+import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..image_folder import frame_number, natural_key, read_image_times
-from ..images import IMAGE_SUFFIXES
+from ..images import IMAGE_SUFFIXES, first_readable, image_size, is_depth_map
+from ..names import folded
 from ..reading import resolve_within
 from ..textfile import read_rows
 from .sequence import LabelClass, Sequence, used_label_ids
@@ -23,6 +25,7 @@ SAME_INSTANT_SECONDS = 0.02
 """Two sensors' measurements at most this far apart belong together: half a frame at 25 a second."""
 
 _MAX_IMAGES_SEARCHED = 300
+_NO_PHOTOGRAPH = re.compile(r"(?<![a-z])(mask|depth|normal|alpha|label|semantic|thumb)s?(?![a-z])", re.IGNORECASE)
 
 
 def read_timed_files(
@@ -56,7 +59,7 @@ def files_for_images(images: list[Path], folder: Path, pattern: str = "*") -> tu
     files = [p for p in files if not p.name.startswith(".")]
     # A name before its dots, and a number, say which image only where no other image has it: of 17.25.png and 17.50.png
     # both are 17.
-    rules: tuple[Callable[[Path], object], ...] = (lambda p: p.stem, _bare_name, frame_number)
+    rules: tuple[Callable[[Path], object], ...] = (lambda p: p.stem, lambda p: folded(p.stem), _bare_name, frame_number)
     found: tuple[Path | None, ...] = (None,) * len(images)
     for rule in rules:
         keys, file_of = [rule(image) for image in images], {rule(p): p for p in reversed(files)}
@@ -69,6 +72,23 @@ def files_for_images(images: list[Path], folder: Path, pattern: str = "*") -> tu
             "give both the same file names or frame numbers"
         )
     return found if any(found) else ()
+
+
+def images_beside(used: list[Path], taken: Iterable[Path | None] = ()) -> list[Path]:
+    """Return the other images in the folders of those that are `used`: of the same kind and size, neither `taken` as
+    something else nor called so."""
+    first, others = first_readable(used), set(used).union(path for path in taken if path is not None)
+    suffixes = {path.suffix.lower() for path in used}
+    found = [p for folder in sorted({path.parent for path in used}) for p in sorted(folder.iterdir())]
+    found = [p for p in found if p.suffix.lower() in suffixes and p not in others and not p.name.startswith(".")]
+    return [p for p in found if not _NO_PHOTOGRAPH.search(p.stem) and p.is_file() and _is_alike(p, first)]
+
+
+def _is_alike(path: Path, first: Path) -> bool:
+    try:
+        return image_size(path) == image_size(first) and not is_depth_map(path)
+    except InputError:
+        return False
 
 
 def poses_for_images(images: list[Path], poses: NDArray[np.float64], source: Path) -> NDArray[np.float64]:

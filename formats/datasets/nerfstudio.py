@@ -10,23 +10,26 @@ from numpy.typing import NDArray
 
 from ..atomic import write_text
 from ..errors import InputError
-from ..image_folder import natural_key
+from ..image_folder import count_images, list_images, natural_key
 from ..images import first_readable, image_size
-from ..reading import named_file
+from ..reading import Listed, named_file
 from ..textfile import number, optional_number, read_json_object
 from ..trajectory import OPENCV_FROM_OPENGL, clean_poses
-from .matching import sequence_of
+from .matching import images_beside, sequence_of
 from .sequence import Camera, Sequence, distortion_names
 
 _FILE_NAMES = ("transforms.json", "transforms_train.json")
 _SUFFIXES_TRIED = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
-_IMAGE_FOLDERS = ("images", "rgb", "frames", "color")
+_IMAGE_FOLDERS = ("images", "rgb", "frames", "color", "images_2", "images_4", "images_8")
 _DEPTH_FOLDERS = ("depths", "depth")
+_MASK_FOLDERS = ("masks", "mask")
+_READ_FILES = ("file_path", "depth_file_path", "mask_path")
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _INTRINSIC_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", *_DISTORTION)
 _MODELS = ("OPENCV", "OPENCV_FISHEYE", "PERSPECTIVE", "PINHOLE", "RADIAL", "SIMPLE_PINHOLE", "SIMPLE_RADIAL")
 _HINTS = {"EQUIRECTANGULAR": "; for whole panoramas pass --camera equirectangular"}
 _SAME_CAMERA = 0.01
+_MAX_NAMED = 4
 _SAME_COEFFICIENT = 0.01
 """By which a distortion coefficient may differ from the mean of all images: less than a pixel for most of the image."""
 
@@ -37,11 +40,13 @@ def recognises(path: Path) -> bool:
 
 
 def open_nerfstudio(path: Path) -> Sequence:
-    """Open the frames of a transforms.json in natural order of their names; missing images are left out and counted.
+    """Open the frames of a transforms.json in natural order of their names, and the images beside them for which it has
+    no frame; missing images are left out and counted.
 
     Poses are turned from OpenGL's camera axes to x right, y down, z forward. Depth (depth_file_path) is in
-    millimetres, as nerfstudio takes it, and then the poses are metric; without it they may have any scale. Raises
-    InputError for a file that does not follow the format or names files outside its folder.
+    millimetres, as nerfstudio takes it, and then the poses are metric; without it they may have any scale. Masks
+    (mask_path) are black where the scene is not. Raises InputError for a file that does not follow the format or names
+    files outside its folder.
     """
     file = _file(path)
     if file is None:
@@ -49,26 +54,53 @@ def open_nerfstudio(path: Path) -> Sequence:
     table = read_json_object(file, allow_nan=True)
     listed = table.get("frames")
     frames = [frame for frame in listed if isinstance(frame, dict)] if isinstance(listed, list) else []
-    images = {id(frame): _image(file, frame) for frame in frames}
-    kept = [frame for frame in frames if images[id(frame)] is not None]
+    seen: Listed = {}
+    images = [_image(file, frame, seen) for frame in frames]
+    kept = [(image, frame) for image, frame in zip(images, frames, strict=True) if image is not None]
     if not kept:
         raise InputError(_why_no_image(file, frames))
-    kept.sort(key=lambda frame: natural_key(str(images[id(frame)])))
-    paths = [p for p in (images[id(frame)] for frame in kept) if p is not None]
-    _require_different(file, kept, paths)
-    poses = np.stack([_matrix(frame, file) for frame in kept]) @ OPENCV_FROM_OPENGL
-    depth_paths = tuple(_depth(file, frame) for frame in kept)
-    camera, notes = _camera(table, kept, file, first_readable(paths))
-    missing = len(frames) - len(kept)
+    _require_different(file, kept)
+    frame_of = dict(kept)
+    camera, notes = _camera(table, list(frame_of.values()), file, first_readable(list(frame_of)))
+    other = {
+        key: {image: _other(file, frame, key, folders, seen) for image, frame in kept}
+        for key, folders in (("depth_file_path", _DEPTH_FOLDERS), ("mask_path", _MASK_FOLDERS))
+    }
+    taken = [p for paths in other.values() for p in paths.values()]
+    # What transforms_train.json does not name is meant for testing.
+    beside = images_beside(list(frame_of), taken) if file.name == _FILE_NAMES[0] else []
+    paths = sorted([*frame_of, *beside], key=lambda p: natural_key(str(p)))
+    poses = np.stack([_matrix(frame_of[p], file) if p in frame_of else np.full((4, 4), np.nan) for p in paths])
+    depths, masks = ([found.get(p) for p in paths] for found in other.values())
     return sequence_of(
         "nerfstudio", path, paths,
         names=_names(file, paths),
         camera=camera,
-        world_from_cam=clean_poses(poses, str(file)),
-        metric=any(depth_paths),
-        depth_paths=depth_paths if any(depth_paths) else (),
-        notes=notes + ((f"{missing} of {len(frames)} frames have no image on disk",) if missing else ()),
+        world_from_cam=clean_poses(poses @ OPENCV_FROM_OPENGL, str(file)),
+        metric=any(depths),
+        depth_paths=tuple(depths) if any(depths) else (),
+        mask_paths=tuple(masks) if any(masks) else (),
+        notes=notes + _notes(file, frames, len(kept), len(beside)),
     )  # fmt: skip
+
+
+def _notes(file: Path, frames: list[dict[str, Any]], kept: int, beside: int) -> tuple[str, ...]:
+    """What of the data set is missing, and what of it has no part in the sequence."""
+    notes = []
+    if kept < len(frames):
+        notes.append(f"{len(frames) - kept} of {len(frames)} frames have no image on disk")
+    if beside:
+        notes.append(
+            f"{beside} of {kept + beside} images have no frame in {file.name}: they are used as well. Where the poses "
+            f"of the others help, give --poses {file}"
+        )
+    unread = sorted({key for frame in frames for key in frame if key.endswith("_path")} - set(_READ_FILES))
+    if unread:
+        notes.append(f"files that the frames name under {', '.join(unread[:_MAX_NAMED])} are not read")
+    tables = sorted(p.name for p in file.parent.glob("transforms_*.json") if p != file)
+    if tables:
+        notes.append(f"{', '.join(tables[:_MAX_NAMED])} beside {file.name} {'are' if tables[1:] else 'is'} not read")
+    return tuple(notes)
 
 
 def _file(path: Path) -> Path | None:
@@ -77,12 +109,12 @@ def _file(path: Path) -> Path | None:
     return next((path / name for name in _FILE_NAMES if (path / name).is_file()), None)
 
 
-def _image(file: Path, frame: dict[str, Any]) -> Path | None:
+def _image(file: Path, frame: dict[str, Any], seen: Listed) -> Path | None:
     name = frame.get("file_path")
     if not isinstance(name, str) or not name:
         raise InputError(f"{file}: a frame has no file_path: expected the image's path relative to the file")
     places = _places(file, name, _IMAGE_FOLDERS)
-    tried = (named_file(places, name + suffix, file) for suffix in _SUFFIXES_TRIED)
+    tried = (named_file(places, name + suffix, file, listed=seen) for suffix in _SUFFIXES_TRIED)
     return next((p for p in tried if p is not None), None)
 
 
@@ -99,14 +131,22 @@ def _why_no_image(file: Path, frames: list[dict[str, Any]]) -> str:
     first = frames[0]["file_path"]
     return (
         f"{file}: none of its {len(frames)} frames has an image on disk. The first is {first[:300]!r}; no such file is "
-        f"in {file.parent}, nor one of its bare name in {', '.join(_IMAGE_FOLDERS)} there (what lies outside of that "
-        f"folder is not read): put the images into {file.parent / _IMAGE_FOLDERS[0]}"
+        f"in {file.parent}, nor one of its bare name in {', '.join(_IMAGE_FOLDERS)} there{_what_there_is(file.parent)} "
+        f"(what lies outside of that folder is not read): put the images into {file.parent / _IMAGE_FOLDERS[0]}"
     )
 
 
-def _require_different(file: Path, frames: list[dict[str, Any]], images: list[Path]) -> None:
+def _what_there_is(folder: Path) -> str:
+    """In words, the images of other names that are in its usual folders."""
+    for inner in (folder / name for name in _IMAGE_FOLDERS):
+        if count := count_images(inner):
+            return f", though {inner.name}/ holds {count} images of other names, such as {list_images(inner)[0].name!r}"
+    return ""
+
+
+def _require_different(file: Path, kept: list[tuple[Path, dict[str, Any]]]) -> None:
     seen: dict[Path, str] = {}
-    for frame, image in zip(frames, images, strict=True):
+    for image, frame in kept:
         other = seen.setdefault(image, frame["file_path"])
         if other is not frame["file_path"]:
             raise InputError(
@@ -115,11 +155,12 @@ def _require_different(file: Path, frames: list[dict[str, Any]], images: list[Pa
             )
 
 
-def _depth(file: Path, frame: dict[str, Any]) -> Path | None:
-    name = frame.get("depth_file_path")
+def _other(file: Path, frame: dict[str, Any], key: str, folders: tuple[str, ...], seen: Listed) -> Path | None:
+    """The PNG that a frame names beside its image: its depth or its mask."""
+    name = frame.get(key)
     if not isinstance(name, str):
         return None
-    path = named_file(_places(file, name, _DEPTH_FOLDERS), name, file)
+    path = named_file(_places(file, name, folders), name, file, listed=seen)
     return path if path is not None and path.suffix.lower() == ".png" else None
 
 

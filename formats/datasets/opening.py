@@ -1,12 +1,13 @@
 """Which data set a folder or file is, and opening it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 
 from ..errors import InputError
-from ..images import IMAGE_SUFFIXES, RAW_SUFFIXES
+from ..image_folder import unused_pictures
+from ..images import IMAGE_SUFFIXES, UNREAD_SUFFIXES
 from ..reading import reaching
 from . import benchmarks, colmap, folder, nerfstudio, scannet
 from .sequence import Sequence
@@ -75,7 +76,7 @@ def looks_like_recording(path: Path) -> bool:
     """
     with reaching(path):
         names = [p.name for p in path.iterdir() if not p.name.startswith(".")]
-    is_image = any(Path(name).suffix.lower() in IMAGE_SUFFIXES | RAW_SUFFIXES for name in names)
+    is_image = any(Path(name).suffix.lower() in IMAGE_SUFFIXES | UNREAD_SUFFIXES for name in names)
     return is_image or not _TRACES.isdisjoint(names) or recognise_source(path) is not None
 
 
@@ -115,4 +116,6 @@ def _open(path: Path, format: str) -> Sequence:
             "or name the format"
         )
     name, place = found
-    return _READERS[name].open(place)
+    sequence = _READERS[name].open(place)
+    others = {*sequence.depth_paths, *sequence.label_paths, *sequence.mask_paths}
+    return replace(sequence, notes=(*sequence.notes, *unused_pictures(sequence.image_paths, others)))

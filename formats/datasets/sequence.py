@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..images import read_depth_png, read_label_png, read_rgb
 from ..reading import parsing
-from ..textfile import is_number, read_json, read_text
+from ..textfile import is_number, read_fields, read_json, read_text
 
 _TABLE_NAME = "scannetv2-labels.combined.tsv"
 _LEVELS_UP = 4
@@ -75,7 +74,8 @@ class Sequence:
     any. depth_paths, label_paths: N paths, None for a frame without; empty without any.
     depth_camera: the camera of the depth images where that is another one than `camera`. Depth in metres is
     raw / depth_per_metre, unknown where raw is one of depth_invalid. classes: what `labels` gives indices into.
-    notes: what a user should know about this recording, one sentence each.
+    mask_paths: N paths as depth_paths, of images that are black where the frame shows no part of the scene. notes: what
+    a user should know about this recording, what of it is not used above all; one sentence each.
     """
 
     format: str
@@ -91,6 +91,7 @@ class Sequence:
     depth_per_metre: float = 1000.0
     depth_invalid: tuple[int, ...] = (0, 65535)
     label_paths: tuple[Path | None, ...] = ()
+    mask_paths: tuple[Path | None, ...] = ()
     classes: tuple[LabelClass, ...] = ()
     store: FrameStore | None = field(default=None, repr=False)
     notes: tuple[str, ...] = ()
@@ -107,7 +108,7 @@ class Sequence:
             raise InputError(
                 f"{self.root}: a depth scale of {self.depth_per_metre:g} units a metre cannot be: correct it"
             )
-        for what in ("image_paths", "depth_paths", "label_paths"):
+        for what in ("image_paths", "depth_paths", "label_paths", "mask_paths"):
             if len(getattr(self, what)) not in (0, n):
                 raise ValueError(f"Sequence: {len(getattr(self, what))} {what} for {n} frames")
         if self.world_from_cam is not None and self.world_from_cam.shape != (n, 4, 4):
@@ -347,12 +348,15 @@ def find_label_table(path: Path) -> Path | None:
 def read_nyu40_classes(path: Path) -> tuple[LabelClass, ...]:
     """Read the NYU40 classes, each with the raw ids that belong to it. Raises InputError for another table."""
     members: dict[tuple[int, str], list[int]] = {}
-    rows = csv.DictReader(read_text(path).splitlines(), delimiter="\t")
+    table = read_fields(path)
+    raw, joined, named = (table.column(name) for name in ("id", "nyu40id", "nyu40class"))
+    if raw is None or joined is None or named is None:
+        raise InputError(f"{path} is not ScanNet's label table (no id, nyu40id or nyu40class): download it again")
     try:
-        for row in rows:
-            if row["nyu40id"] and int(row["nyu40id"]) > 0:
-                members.setdefault((int(row["nyu40id"]), row["nyu40class"]), []).append(int(row["id"]))
-    except (KeyError, TypeError, ValueError) as error:
+        for row in table.rows:
+            if len(row) > max(raw, joined, named) and row[joined] and int(row[joined]) > 0:
+                members.setdefault((int(row[joined]), row[named]), []).append(int(row[raw]))
+    except ValueError as error:
         raise InputError(f"{path} is not ScanNet's label table ({error}): download it again") from error
     if not members or any(not 0 <= i <= 65535 for ids in members.values() for i in ids):
         raise InputError(f"{path} is not ScanNet's label table: download it again")

@@ -14,7 +14,7 @@ from ...formats.datasets import Sequence
 from ...formats.errors import InputError
 from ...formats.image_folder import frame_number
 from ...formats.textfile import read_rows
-from ...formats.trajectory import read_matrices, read_tum
+from ...formats.trajectory import read_trajectory
 from ..geometry import se3
 from ..geometry.se3 import Similarity, align_points
 from ..outcome import Outcome, spread_sample
@@ -164,12 +164,13 @@ def _dense_trajectory(root: Path) -> tuple[NDArray[np.float64], NDArray[np.float
     poses_file, times_file = root / "traj.txt", root / "timestamps.txt"
     if not poses_file.is_file():
         return None
-    if len(next(iter(read_rows(poses_file)), ())) == 8:
-        return read_tum(poses_file)
+    found = read_trajectory(poses_file)
+    poses = found.world_from_cam
+    if found.times is not None:
+        return found.times, poses
     if not times_file.is_file():
         return None
     rows = read_rows(times_file)
-    poses = read_matrices(poses_file)
     if len(rows) != len(poses) or any(len(r) != 1 for r in rows):
         return None
     known = np.isfinite(poses).all(axis=(1, 2))

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ...formats.errors import InputError
 from ...formats.image_folder import frame_number, natural_key
 from ...formats.images import image_size, read_rgb, to_grey
+from ...formats.names import match_names
 from ...formats.reading import files_sha256
 from ...formats.textfile import read_json, write_json
 from ..config import Config
@@ -42,15 +43,14 @@ _LITTLE, _LOOKED_AT = 0.05, 40
 
 def mask_inputs(source: Path, config: Config) -> dict[str, str] | None:
     """Return digests of the user's masks and of the networks for people; None without any."""
-    folder, cards = config.frames.masks, _cards(config)
-    found = {"masks": open_masks(Path(folder), open_source(source, config.run.format)).digest()} if folder else {}
+    files, cards = masks_for(config, open_source(source, config.run.format)), _cards(config)
+    found = {"masks": files.digest()} if files.paths else {}
     return found | ({"people": cards.identity()} if cards else {}) or None
 
 
 def check_masks(source: Path, config: Config) -> None:
     """InputError for masks of another name or size than the images, and networks that are not what they should be."""
-    if config.frames.masks:
-        open_masks(Path(config.frames.masks), open_source(source, config.run.format))
+    masks_for(config, open_source(source, config.run.format))
     if cards := _cards(config):
         PeopleFinder(cards, 1)
 
@@ -71,8 +71,8 @@ class FrameMasks:
         self, config: Config, source: Source, folder: Path, picked: Path, threads: int,
         faces: Faces | None = None, rig: Rig = ONE_CAMERA,
     ) -> None:  # fmt: skip
-        self._source = source
-        self._files = open_masks(Path(config.frames.masks), source) if config.frames.masks else MaskFiles({})
+        self._source, self._are_given = source, bool(config.frames.masks)
+        self._files = masks_for(config, source)
         self._cards, self._is_forced = _cards(config), config.frames.people == "mask"
         self.folder, self._picked, self._threads = folder, picked, threads
         self._faces, self._rig = faces, rig
@@ -184,8 +184,9 @@ class FrameMasks:
             return None
         by, rule = "the transparent backgrounds of the images", "Give the images without transparency"
         if self._files.paths:
-            by = f"the masks of --masks {next(iter(self._files.paths.values())).parent}"
-            rule = "Black (0) is left out, all else is kept: invert masks that mean the opposite, or omit --masks"
+            folder = next(iter(self._files.paths.values())).parent
+            by = f"the masks of {'--masks' if self._are_given else 'the data set,'} {folder}"
+            rule = "Black (0) is left out, all else is kept: invert masks that mean the opposite, or omit them"
         return f"{by} leave only {left:.1%} of the images, too little for a reconstruction. {rule}"
 
     def write(self, folder: Path, frames: Sequence[Frame], lens: Lens) -> dict[str, Any]:
@@ -239,6 +240,14 @@ def reduce_mask(left_out: NDArray[np.bool_], width: int, height: int) -> NDArray
     return np.asarray(cv2.resize(scene, (width, height), interpolation=cv2.INTER_AREA) <= 0.5)
 
 
+def masks_for(config: Config, source: Source) -> MaskFiles:
+    """Return the masks of --masks, else those that the source names itself. Raises InputError as `open_masks`."""
+    if config.frames.masks:
+        return open_masks(Path(config.frames.masks), source)
+    named = () if isinstance(source, VideoSource) else source.sequence.mask_paths
+    return _of_one_size({i: path for i, path in enumerate(named) if path is not None}, source)
+
+
 def open_masks(folder: Path, source: Source) -> MaskFiles:
     """The masks of a source's images: NAME.jpg.png or NAME.png for the image NAME.jpg, or the number of the frame in
     the video (from 0). Not every image needs one.
@@ -247,7 +256,7 @@ def open_masks(folder: Path, source: Source) -> MaskFiles:
     """
     if not folder.is_dir():
         raise InputError(f"--masks {folder}: there is no such folder")
-    files = sorted((p for p in folder.glob("*.png") if p.is_file()), key=lambda p: natural_key(p.name))
+    files = sorted((p for p in folder.rglob("*.png") if p.is_file()), key=lambda p: natural_key(p.name))
     if not files:
         raise InputError(f"--masks {folder}: holds no PNG files. A mask is an 8 bit PNG, black is left out")
     paths, strangers = _by_number(files, source) if isinstance(source, VideoSource) else _by_name(files, source)
@@ -261,6 +270,10 @@ def open_masks(folder: Path, source: Source) -> MaskFiles:
             f"--masks {folder}: {len(strangers)} of {len(files)} files belong to no image, the first is "
             f"{strangers[0].name}. The name of a mask is {rule}"
         )
+    return _of_one_size(paths, source)
+
+
+def _of_one_size(paths: dict[int, Path], source: Source) -> MaskFiles:
     turns = {}
     for index, path in paths.items():
         turn = source.turns_from_upright(index) if isinstance(source, FolderSource) else 0
@@ -282,9 +295,10 @@ def _by_number(files: list[Path], source: Source) -> tuple[dict[int, Path], list
 
 
 def _by_name(files: list[Path], source: Source) -> tuple[dict[int, Path], list[Path]]:
-    names = [source.name(i, i) for i in range(source.expected_frames)]
-    whose = {f"{Path(n).stem}.png": i for i, n in enumerate(names)} | {f"{n}.png": i for i, n in enumerate(names)}
-    return {whose[p.name]: p for p in files if p.name in whose}, [p for p in files if p.name not in whose]
+    places = [] if isinstance(source, VideoSource) else [source.place(i) for i in range(source.expected_frames)]
+    found = match_names([str(p.with_suffix("")) for p in files], places)
+    paths = {i: p for i, p in zip(found, files, strict=True) if i is not None}
+    return paths, [p for i, p in zip(found, files, strict=True) if i is None]
 
 
 def picked(context: StageContext, name: str) -> Path:

@@ -48,7 +48,9 @@ def world_on_earth(outcome: Outcome, world: World, gps: str) -> tuple[World, str
 def _track(gps: str) -> Track:
     track = read_track(Path(gps))
     if track.lost:
-        log.warning("%s: %d of its rows are no time with a latitude and longitude, and are left out", gps, track.lost)
+        log.warning(
+            "%s: %d of its rows are no time or name with a latitude and longitude, and are left out", gps, track.lost
+        )
     return track
 
 
@@ -76,7 +78,9 @@ def _exif_places(outcome: Outcome) -> Array:
 
 def _track_places(outcome: Outcome, track: Track) -> Array | str:
     """By time, or in words why not. A video counts from its beginning: a track of another day is taken to begin with
-    it. What lies between two fixes is no fix."""
+    it. What lies between two fixes is no fix. A table of images is looked up by their names."""
+    if track.names:
+        return track.of([frame.name for frame in outcome.frames])
     times = np.array([frame.timestamp for frame in outcome.frames])
     if times[-1] < track.times[0] or times[0] > track.times[-1]:
         track = replace(track, times=track.times - track.times[0] + times[0])

@@ -1,6 +1,7 @@
 """Poses and calibration as the user gives them, and which pose belongs to which frame."""
 
 import itertools
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,7 +13,8 @@ from ...formats.datasets.matching import SAME_INSTANT_SECONDS, poses_at
 from ...formats.datasets.sequence import Camera
 from ...formats.errors import InputError
 from ...formats.image_folder import frame_number
-from ...formats.poses import PoseFile, read_poses, stem
+from ...formats.names import match_names, stem
+from ...formats.poses import PoseFile, read_poses
 from ...formats.reading import file_sha256, files_sha256, home_expanded, reaching
 from ...formats.textfile import read_rows
 from ..config import FramesConfig
@@ -42,7 +44,7 @@ def given_poses(
 
     file = read_poses(Path(config.poses))
     if file.names:
-        found = _by_name(file, source, frames)
+        found = _by_name(file, source, frames, config.poses)
     elif file.times is not None and source.has_times:
         found = poses_at(np.array([f.timestamp for f in frames]), file.times, file.world_from_cam, SAME_INSTANT_SECONDS)
     else:
@@ -102,13 +104,16 @@ def pose_inputs(config: FramesConfig) -> dict[str, str]:
     return {"poses": files_sha256((p.name, p) for p in files)}
 
 
-def _by_name(file: PoseFile, source: Source, frames: Sequence[Frame]) -> NDArray[np.float64]:
+def _by_name(file: PoseFile, source: Source, frames: Sequence[Frame], path: str) -> NDArray[np.float64]:
     """A video's frames are called by their numbers."""
     if isinstance(source, VideoSource):
-        rows = {frame_number(Path(n.replace(".", "_"))): k for k, n in enumerate(file.names)}
-        return _rows(file, [rows.get(f.source_index) for f in frames])
-    named = {n: k for k, n in enumerate(file.names)}
-    return _rows(file, [named.get(stem(source.name(f.id, f.source_index))) for f in frames])
+        numbers = [frame_number(Path(stem(n).replace(".", "_"))) for n in file.names]
+        twice = next((n for n, count in Counter(numbers).items() if n is not None and count > 1), None)
+        if twice is not None:
+            raise InputError(f"--poses {path}: two poses are of images with the number {twice}: names must differ")
+        row_of = {n: k for k, n in enumerate(numbers)}
+        return _rows(file, [row_of.get(f.source_index) for f in frames])
+    return _rows(file, match_names([source.place(f.source_index) for f in frames], file.names))
 
 
 def _by_order(file: PoseFile, source: Source, frames: Sequence[Frame], path: str) -> NDArray[np.float64]:
@@ -130,7 +135,7 @@ def _rows(file: PoseFile, rows: Sequence[int | None]) -> NDArray[np.float64]:
 
 def _examples(file: PoseFile, frames: Sequence[Frame]) -> str:
     if file.names:
-        return f" (its first is of {file.names[0]!r}, the source's first image is {stem(frames[0].name)!r})"
+        return f" (its first is of {file.names[0]!r}, the source's first image is {frames[0].name!r})"
     if file.times is None:
         return ""
     return f" (it begins at {file.times[0]:.2f} s, the source at {frames[0].timestamp:.2f} s)"

@@ -20,6 +20,8 @@ from .recording import Headers, ImageSource, RecordingSource, Warn, open_recordi
 
 LIST_SUFFIX = ".videos"
 _LONGEST_LIST = 100_000
+_FEWEST_OF_ONE_SIZE, _RARE = 4, 10
+"""Images of one size, beside which one, or a tenth as many, may be of others."""
 _PAUSE = 10.0
 """Seconds on the clock of the run between two videos: no velocity goes on from one to the next."""
 
@@ -85,12 +87,15 @@ def video_files(path: Path) -> tuple[Path, ...]:
 
 
 class FolderSource(ImageSource):
-    """The images directly in a folder, in natural order of their names; depth maps among them are left out."""
+    """The images directly in a folder, in natural order of their names; depth maps among them, and a few of another
+    size than the rest, are left out."""
 
     def __init__(self, path: Path) -> None:
-        images = _without_depth_maps(list_images(path))
-        names = tuple(image.name for image in images)
-        notes = _notes_on_unread(path)
+        listed = list_images(path)
+        images = _without_depth_maps(listed)
+        names, notes = tuple(image.name for image in images), _notes_on_unread(path)
+        if len(images) < len(listed):
+            notes += (f"{len(listed) - len(images)} depth maps among the images are left out",)
         super().__init__(Sequence("images", path, names, read_image_times(images), tuple(images), notes=notes))
 
     def _of_one_size(self, headers: Headers) -> Headers:

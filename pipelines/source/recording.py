@@ -115,6 +115,11 @@ class ImageSource:
         """The image's own name; formats that are not written here become .png."""
         return self._names[index]
 
+    def place(self, index: int) -> str:
+        """Return the path by which other programs may name image `index`, its name where it is no file."""
+        paths = self.sequence.image_paths
+        return str(paths[index]) if paths else self.sequence.names[index]
+
     def original(self, index: int) -> Path | None:
         """The image's file, unless other programs would see it turned, transparent or not at all."""
         path = self.sequence.image_paths[index] if self.sequence.image_paths else None

@@ -31,6 +31,7 @@ from msgs_slam.formats.datasets.calibration import read_intrinsics_json
 from msgs_slam.formats.datasets.sequence import read_class_table, read_nyu40_classes
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gaussians import GaussianCloud
+from msgs_slam.formats.gps import read_track
 from msgs_slam.formats.image_folder import (
     list_images,  # fmt: skip
     read_image_times,
@@ -48,6 +49,7 @@ from msgs_slam.formats.images import (
 )
 from msgs_slam.formats.mesh import MeshArrays, MeshBlocks, read_mesh_ply, write_mesh_ply
 from msgs_slam.formats.ply import write_gaussian_ply
+from msgs_slam.formats.poses import read_poses
 from msgs_slam.formats.splats import read_gaussians, write_gaussian_glb
 from msgs_slam.formats.spz import write_spz
 from msgs_slam.formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
@@ -448,6 +450,40 @@ def text(name: str, content: str) -> Callable[[Path], None]:
     return lambda folder: (folder / name).write_text(content)
 
 
+def given_poses(path: Path) -> None:
+    found = read_poses(path)
+    judge_poses(found.world_from_cam)
+    need(len(found.names) in (0, len(found)), "names of other poses")
+    if found.times is not None:
+        finite(found.times, "times")
+
+
+def track(path: Path) -> None:
+    found = read_track(path)
+    finite(found.times, "times")
+    need((np.diff(found.times) > 0).all(), "times go back")
+    finite(found.degrees, "degrees")
+    need((np.abs(found.degrees) <= [90, 180]).all(), "a place outside of the Earth")
+
+
+HEADINGS = "timestamp, frame, x, y, z, qx, qy, qz, qw\n"
+ODOMETRY = HEADINGS + "".join(f"{i}, {i:06d}, {i}, 0, 1, 0, 0, 0, 1\n" for i in range(5))
+NAMED = "".join(f"IMG {i}.jpg;{i};0;1;0;0;0;1\n" for i in range(5))
+IDENTITY = " ".join(map(str, np.eye(4).ravel()))
+CAMERAS_XML = (
+    "<document><chunk><sensors><sensor><calibration type='frame'><resolution width='640' height='480'/>"
+    "<f>500</f><cx>1</cx><k1>-0.1</k1></calibration></sensor></sensors><cameras>"
+    + "".join(f"<camera label='{i}'><transform>{IDENTITY}</transform></camera>" for i in range(4))
+    + "</cameras></chunk></document>"
+)
+SHOTS = {f"{i}.jpg": {"rotation": [0, 0.1, i], "translation": [i, 0, 1]} for i in range(4)}
+SFM = {"width": "640", "height": "480", "sensorWidth": "36", "focalLength": "28", "type": "radial3"}
+SUBTITLES = "".join(
+    f"{i}\n00:00:0{i},000 --> 00:00:0{i},900\n[latitude: 48.{i}] [longitude: 11.{i}] [rel_alt: 1 abs_alt: 5{i}]\n\n"
+    for i in range(5)
+)
+GEO = "EPSG:4326\n" + "".join(f"{i}.jpg 11.{i} 48.{i} 50{i}\n" for i in range(5))
+
 ARRAYS = {"a": np.arange(20.0), "b": np.ones((3, 4), np.uint8), "s": np.array(["x", ""])}
 NYU = "id\traw_category\tnyu40id\tnyu40class\n1\twall\t1\twall\n2\tchair\t5\tchair\n22\tx\t0\tunannotated\n"
 CLASS_MAP = 'truth = ["wall", "couch"]\n[classes]\nwall = "wall"\nsofa = ["couch", "wall"]\n'
@@ -478,6 +514,14 @@ DOORS: dict[str, Door] = {
     "matrices": Door(
         lambda f: write_matrices(f / "a.txt", random_poses(FRAMES, 2)), lambda p: judge_poses(read_matrices(p)), "a.txt"
     ),
+    "poses, odometry.csv": Door(text("odometry.csv", ODOMETRY), given_poses, "odometry.csv", in_text),
+    "poses, table of names": Door(text("a.csv", "name;x;y;z;qx;qy;qz;qw\n" + NAMED), given_poses, "a.csv", in_text),
+    "poses, Metashape": Door(text("a.xml", CAMERAS_XML), given_poses, "a.xml", in_text),
+    "poses, OpenDroneMap": Door(lambda f: write_json(f / "a.json", [{"shots": SHOTS}]), given_poses, "a.json", in_json),
+    "poses, COLMAP": Door(make_colmap(".txt"), given_poses),
+    "track, subtitles": Door(text("a.srt", SUBTITLES), track, "a.srt", in_text),
+    "track, geo.txt": Door(text("geo.txt", GEO), track, "geo.txt", in_text),
+    "track, table": Door(text("a.csv", "time,lat,lon\n0,1,2\n1,1,2\n2,1,2\n3,1,2\n"), track, "a.csv", in_text),
     **{
         f"picture {name.split('.')[1]}": Door(make_picture(name), picture, name)
         for name in ("a.jpg", "a.png", "a.tif", "a.webp", "a.heic")
@@ -498,6 +542,13 @@ DOORS: dict[str, Door] = {
     "--intrinsics YAML": Door(
         text("ros.yaml", "camera_matrix:\n  data: [500, 0, 320, 0, 501, 240, 0, 0, 1]\n"),
         lambda p: judge_camera(read_intrinsics(str(p), 640, 480)), "ros.yaml", in_text,
+    ),
+    "--intrinsics XML": Door(
+        text("a.xml", CAMERAS_XML), lambda p: judge_camera(read_intrinsics(str(p), 640, 480)), "a.xml", in_text,
+    ),
+    "--intrinsics of Meshroom": Door(
+        lambda f: write_json(f / "cameras.sfm", {"intrinsics": [SFM]}),
+        lambda p: judge_camera(read_intrinsics(str(p), 640, 480)), "cameras.sfm", in_json,
     ),
     "class table, JSON": Door(make_truth, read_class_table, "classes.json", in_json, "classes.json"),
     "class table, text": Door(text("labels.txt", "0 wall x\n1 sofa\n2 floor\n"), read_class_table, "labels.txt"),

@@ -1,5 +1,6 @@
 """Files and names made to break readers, one by one: refused with words, at once and in little memory."""
 
+import contextlib
 import gzip
 import io
 import itertools
@@ -9,6 +10,7 @@ import re
 import resource
 import socket
 import struct
+import time
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -22,14 +24,19 @@ from PIL import Image
 
 from msgs_slam.formats.colmap import read_colmap_model
 from msgs_slam.formats.datasets import open_sequence
+from msgs_slam.formats.datasets.calibration import read_calibration_file, read_yaml
+from msgs_slam.formats.datasets.sequence import read_class_table, read_nyu40_classes
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.gps import read_track
+from msgs_slam.formats.image_folder import read_image_times
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.formats.poses import read_poses
 from msgs_slam.formats.splats import read_gaussians
 from msgs_slam.formats.tensors import load_arrays, load_tensors
 from msgs_slam.formats.textfile import read_json, read_toml
 from msgs_slam.formats.trajectory import read_matrices, read_tum
-from msgs_slam.pipelines.source.opening import FolderSource, open_source, source_digest
+from msgs_slam.pipelines.source.opening import FolderSource, open_source, source_digest, video_files
 from msgs_slam.pipelines.source.recording import RecordingSource
 
 Read = Callable[[Path], Any]
@@ -153,6 +160,55 @@ def test_a_card_must_name_the_output(tmp_path: Path) -> None:
     card.write_text(text)
     with pytest.raises(InputError, match="it has no output ''"):
         DOORS["card"].read(tmp_path / DOORS["card"].entry)
+
+
+# time ----------------------------------------------------------------------------------------------------------------
+
+REPEATED = {
+    "blank lines": "\n", "blanks": " ", "one word": "a", "one number": "1", "numbers": "1 ", "commas": ",",
+    "semicolons": ";", "quotes": '"', "escaped quotes": '\\"', "lists": "[", "lists of keys": "data: [\n",
+    "objects": '{"a":', "elements": "<a>",
+    "comments": "# 1\n", "colons": "a:", "brackets": "[latitude: ", "dots": "1.", "indents": " -\n",
+}  # fmt: skip
+PARSERS: dict[str, tuple[str, Read]] = {
+    "TUM": ("a.txt", read_tum),
+    "poses": ("a.csv", read_poses),
+    "poses, JSON": ("a.json", read_poses),
+    "poses, XML": ("a.xml", read_poses),
+    "track": ("a.gpx", read_track),
+    "track, table": ("a.csv", read_track),
+    "track, subtitles": ("a.srt", read_track),
+    "calibration, YAML": ("a.yaml", lambda p: read_calibration_file(p, (64, 48))),
+    "calibration, XML": ("a.xml", lambda p: read_calibration_file(p, (64, 48))),
+    "calibration, text": ("a.txt", lambda p: read_calibration_file(p, (64, 48))),
+    "calibration, JSON": ("a.json", lambda p: read_calibration_file(p, (64, 48))),
+    "EuRoC's sensor": ("sensor.yaml", read_yaml),
+    "classes": ("a.txt", read_class_table),
+    "classes of ScanNet": ("a.tsv", read_nyu40_classes),
+    "TOML": ("a.toml", read_toml),
+    "transforms": ("transforms.json", open_sequence),
+    "times": ("times.txt", lambda p: read_image_times([p.parent / "1.png"])),
+    "PLY": ("a.ply", read_gaussians),
+    "list of videos": ("a.videos", video_files),
+}
+
+
+@pytest.mark.parametrize("what", PARSERS)
+def test_text_is_read_in_a_time_that_grows_as_it_does(what: str, tmp_path: Path) -> None:
+    """Eight times as much takes eight times as long, with room for noise and for what takes no time at all."""
+    name, read = PARSERS[what]
+    head = {"PLY": "ply\n", "track": "<gpx>", "poses, XML": "<a>", "calibration, XML": "<a>"}.get(what, "")
+
+    def seconds(text: str) -> float:
+        (tmp_path / name).write_text(head + text)
+        started = time.process_time()
+        with contextlib.suppress(InputError):
+            read(tmp_path / name)
+        return time.process_time() - started
+
+    for kind, piece in REPEATED.items():
+        few = max(seconds(piece * 2000), 0.03)
+        assert seconds(piece * 16_000) < 24 * few, kind
 
 
 # sources ------------------------------------------------------------------------------------------------------------

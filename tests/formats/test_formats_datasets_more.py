@@ -3,6 +3,7 @@
 import json
 import re
 import struct
+import unicodedata
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +13,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.colmap import write_colmap_model
+from msgs_slam.formats.colmap import read_colmap_model, write_colmap_model
 from msgs_slam.formats.datasets import VOID_LABEL, Camera, open_sequence, recognise
 from msgs_slam.formats.datasets.colmap import camera_from_colmap
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
+from msgs_slam.formats.poses import read_poses
+from msgs_slam.pipelines.source.recording import RecordingSource
 from tests.colmap_models import posed_images
 from tests.matrices import random_poses, write_matrices
 
@@ -148,6 +151,9 @@ def test_euroc(tmp_path: Path, known: Known) -> None:
         np.testing.assert_allclose(sequence.world_from_cam[1:], known.poses[1:], atol=1e-9)
         np.testing.assert_allclose(np.diff(sequence.timestamps), 0.05, atol=1e-6)
         assert (sequence.rgb(2)[:, :, 1] == 80).all()
+    assert sequence.notes == ()
+    (tmp_path / "mav0" / "cam1").mkdir()
+    assert "cam1/, is not read" in open_sequence(tmp_path).notes[0]
     (cam / "sensor.yaml").write_text("intrinsics: [1, 2]\n")
     with pytest.raises(InputError, match="list of 4 numbers"):
         open_sequence(tmp_path)
@@ -305,6 +311,65 @@ def test_colmap_models_at_hand(shared_data: Path) -> None:
     assert "10 different cameras" in photos.notes[0]
 
 
+def test_colmap_uses_its_largest_model_and_all_images(tmp_path: Path, known: Known) -> None:
+    names = [f"{i}.png" for i in range(N)]
+    _colmap_folder(tmp_path, known, names)
+    camera = (WIDTH, HEIGHT, 50.0, 51.0, 32.5, 24.0)
+    largest = posed_images(names[:4], np.linalg.inv(known.poses[:4]), *camera)
+    write_colmap_model(tmp_path / "sparse" / "1", largest)
+    write_colmap_model(tmp_path / "sparse" / "0", posed_images(names[2:4], np.linalg.inv(known.poses[2:4]), *camera))
+    for suffix in (".bin", ".txt"):
+        sequence = open_sequence(tmp_path)
+        assert sequence.has_pose.tolist() == [True] * 4 + [False]
+        np.testing.assert_allclose(sequence.world_from_cam[:4], known.poses[:4], atol=1e-12)
+        assert [(sequence.rgb(i) == known.rgb[i]).all() for i in range(N)] == [True] * N
+        assert "1 of the 5 images in images/ have no pose in the model 1/" in sequence.notes[0]
+        assert "of 2 models the largest, 1/, is used, not 0/" in sequence.notes[1]
+        assert read_poses(tmp_path).names == tuple(names[:4])
+        for path in tmp_path.glob(f"sparse/*/*{suffix}"):
+            path.unlink()
+        if suffix == ".bin":
+            assert list(tmp_path.glob("sparse/*/*.txt"))
+
+
+def test_colmap_leaves_out_what_is_no_photograph_of_its_kind(tmp_path: Path, known: Known) -> None:
+    names = [f"{i}.png" for i in range(N)]
+    _colmap_folder(tmp_path, known, names)
+    write_rgb(tmp_path / "images" / "0_mask.png", known.rgb[0])
+    write_rgb(tmp_path / "images" / "cam_b" / "0.png", known.rgb[0])
+    write_rgb(tmp_path / "images" / "large.png", np.tile(known.rgb[0], (2, 2, 1)))
+    for name in ("7.CR3", "8.jxl", "0.cr2", "clip.mp4"):
+        (tmp_path / "images" / name).touch()
+    for i in (1, 2):
+        write_grey_png(tmp_path / "masks" / f"{i}.png{'.png' if i == 1 else ''}", np.zeros((HEIGHT, WIDTH), np.uint8))
+    sequence = open_sequence(tmp_path)
+    assert sequence.names == tuple(names)
+    assert [None if p is None else p.name for p in sequence.mask_paths] == [None, "1.png.png", "2.png", None, None]
+    assert "left out (1 in images/cam_b/)" in sequence.notes[0]
+    assert sequence.notes[1] == "2 images beside the 5 that are read are not named by the data set: left out"
+    assert "(1 .cr3, 1 .jxl, 1 .mp4)" in sequence.notes[2]
+
+
+def test_colmap_images_that_were_reduced(tmp_path: Path, known: Known) -> None:
+    _colmap_folder(tmp_path, known, [f"{i}.png" for i in range(N)])
+    for i, path in enumerate(sorted((tmp_path / "images").iterdir())):
+        write_rgb(tmp_path / "images_4" / path.name, known.rgb[i][::4, ::4])
+        path.unlink()
+    source = RecordingSource(open_sequence(tmp_path))
+    assert source.known_camera() == Camera(WIDTH // 4, HEIGHT // 4, 12.5, 12.75, 8.125, 6)
+
+
+def test_colmap_text_with_blanks_in_names_and_without_points(tmp_path: Path, known: Known) -> None:
+    names = [f"cam {'ab'[i % 2]}/IMG {i}.png" for i in range(N)]
+    _colmap_folder(tmp_path, known, names)
+    for path in (tmp_path / "sparse" / "0").glob("*.bin"):
+        path.unlink()
+    for points in ("# a heading\n", ""):
+        (tmp_path / "sparse" / "0" / "points3D.txt").write_text(points)
+        assert read_colmap_model(tmp_path / "sparse" / "0").names == tuple(sorted(names))
+        assert open_sequence(tmp_path).has_pose.all()
+
+
 def test_colmap_images_that_lead_out_are_refused(tmp_path: Path, known: Known) -> None:
     _colmap_folder(tmp_path, known, [f"{i}.png" for i in range(N)])
     for kind in ("bin", "txt"):
@@ -367,6 +432,36 @@ def test_nerfstudio(tmp_path: Path, known: Known) -> None:
         np.testing.assert_allclose(depth, known.depth[2])
 
 
+def test_nerfstudio_uses_all_images_and_the_masks_it_names(tmp_path: Path, known: Known) -> None:
+    table = _transforms(tmp_path, known)
+    for i, frame in enumerate(table["frames"]):
+        frame["mask_path"], frame["normal_file_path"] = f"masks/{frame['file_path'][7:]}", f"normals/{i}.png"
+        write_grey_png(tmp_path / frame["mask_path"], np.zeros((HEIGHT, WIDTH), np.uint8))
+    (tmp_path / "transforms.json").write_text(json.dumps(table | {"frames": table["frames"][:3]}))
+    sequence = open_sequence(tmp_path)
+    assert sequence.has_pose.tolist() == [False, False, True, True, True]
+    assert [p and p.name for p in sequence.mask_paths] == [None, None, *(f"frame_{i}.png" for i in (2, 3, 4))]
+    assert "2 of 5 images have no frame in transforms.json" in sequence.notes[0]
+    assert "under normal_file_path are not read" in sequence.notes[1]
+
+
+@pytest.mark.parametrize("change", ["form", "case"])
+def test_names_in_another_unicode_form_or_case(change: str, tmp_path: Path, known: Known) -> None:
+    table = _transforms(tmp_path, known)
+    for i, frame in enumerate(table["frames"]):
+        path = tmp_path / frame["file_path"]
+        frame["file_path"] = "images/" + unicodedata.normalize("NFC", f"Küche_{i}.png")
+        new = unicodedata.normalize("NFD", f"Küche_{i}.png") if change == "form" else f"KÜCHE_{i}.PNG"
+        path.rename(path.with_name(new))
+    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    assert open_sequence(tmp_path).has_pose.all()
+    (tmp_path / "images").rename(tmp_path / "other")
+    for i in range(N):
+        write_rgb(tmp_path / "images" / f"Bad_{i}.png", known.rgb[i])
+    with pytest.raises(InputError, match="images/ holds 5 images of other names, such as 'Bad_0"):
+        open_sequence(tmp_path)
+
+
 def test_blender_style_transforms(tmp_path: Path, known: Known) -> None:
     table = _transforms(tmp_path, known)
     for frame in table["frames"]:
@@ -382,6 +477,8 @@ def test_blender_style_transforms(tmp_path: Path, known: Known) -> None:
     assert sequence.camera is not None
     assert (sequence.camera.fx, sequence.camera.cx) == pytest.approx((40, WIDTH / 2))
     assert "1 of 6 frames have no image" in sequence.notes[0]
+    (tmp_path / "transforms_test.json").write_text("{}")
+    assert "transforms_test.json beside transforms_train.json is not read" in open_sequence(tmp_path).notes
 
 
 @pytest.mark.parametrize(

@@ -68,9 +68,14 @@ def test_folders_without_images_are_explained(tmp_path: Path) -> None:
         list_images(tmp_path / "none")
     with pytest.raises(InputError, match="no images in"):
         list_images(tmp_path)
-    (tmp_path / "IMG_1.DNG").touch()
-    with pytest.raises(InputError, match=r"\.dng files are not supported"):
+    _touch_images(tmp_path / "keyframes" / "images", ["0.png", "1.png", "2.png"])  # as Polycam's raw data
+    _touch_images(tmp_path / "other", ["0.png", "1.png"])
+    with pytest.raises(InputError, match="the folder keyframes/images/ in it holds 3 images: give that"):
         list_images(tmp_path)
+    for name in ("IMG_1.DNG", "IMG_1.CR3"):
+        (tmp_path / name).touch()
+        with pytest.raises(InputError, match=r"\.dng files are not supported"):
+            list_images(tmp_path)
 
 
 def test_png_is_lossless_for_a_foreign_reader(tmp_path: Path, picture: np.ndarray) -> None:
@@ -181,6 +186,16 @@ def test_heic_is_upright(tmp_path: Path, picture: np.ndarray, orientation: int) 
     assert image_size(tmp_path / "b.heic") == (heic.shape[1], heic.shape[0])
     assert heic.shape == jpeg.shape
     assert 0 < np.abs(heic.astype(int) - jpeg).mean() < 3
+
+
+@pytest.mark.parametrize(
+    ("latitude", "south", "expected"),
+    [((10.51,), "S", -10.51), (10.51, "N", 10.51), (-10.51, "S", -10.51), ((10.0, 30.6), "S", -10.51)],
+)
+def test_places_of_one_or_two_numbers_are_read(latitude: object, south: str, expected: float) -> None:
+    found = place_of({1: south, 2: latitude, 3: "E", 4: (20.0, 15.0, 36.0)})
+    assert found is not None
+    assert found[:2] == pytest.approx((expected, 20.26))
 
 
 @pytest.mark.parametrize("south", ["S", b"S\0"])
@@ -378,6 +393,20 @@ def test_times_by_order_by_number_and_by_name(tmp_path: Path) -> None:
     assert read_image_times(images) == pytest.approx([4, 5, 6])
 
 
+def test_times_above_count_only_where_they_are_of_a_data_set(tmp_path: Path) -> None:
+    photos = _touch_images(tmp_path / "photos", ["a.png", "b.png"])
+    images = _touch_images(tmp_path / "images", ["a.png", "b.png"])
+    for text in ("bus leaves at 9\n", "1\n"):
+        (tmp_path / "times.txt").write_text(text)
+        assert read_image_times(photos) is None
+        assert read_image_times(images) is None
+    (tmp_path / "times.txt").write_text("1\n2\n")
+    assert read_image_times(photos) is None
+    assert read_image_times(images) == pytest.approx([1, 2])
+    (tmp_path / "calib.txt").touch()
+    assert read_image_times(photos) == pytest.approx([1, 2])
+
+
 def test_times_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     images = _touch_images(tmp_path, ["a.png", "b.png"])
     assert read_image_times(images) is None
@@ -402,6 +431,7 @@ def test_frame_numbers() -> None:
     assert frame_number(Path("x1/frame-000012.color.jpg")) == 12
     assert frame_number(Path("rgb_7.png")) == 7
     assert frame_number(Path("cover.png")) is None
+    assert frame_number(Path("9" * 5000)) is None
 
 
 SRGB_IN_XYZ = np.array([[0.43607, 0.38515, 0.14307], [0.22249, 0.71687, 0.06061], [0.01392, 0.09708, 0.71410]])

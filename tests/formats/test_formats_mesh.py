@@ -66,6 +66,15 @@ def test_ply_round_trip_and_foreign_readers(tmp_path: Path, sphere: tuple) -> No
     np.testing.assert_array_equal(loaded.vertices, vertices)
 
 
+def test_any_class_name_is_kept_in_a_ply(tmp_path: Path, sphere: tuple) -> None:
+    names = ("Küche", "element foo 3", "end_header")
+    write_mesh_ply(tmp_path / "mesh.ply", blocks(*sphere), class_names=names)
+    assert (read_mesh_ply(tmp_path / "mesh.ply").vertices == sphere[0]).all()
+    assert sum(len(block) for block in mesh_blocks(tmp_path / "mesh.ply").faces()) == len(sphere[1])
+    comments = plyfile.PlyData.read(str(tmp_path / "mesh.ply")).comments
+    assert [c.encode().decode("unicode_escape").split(" ", 2)[2] for c in comments] == list(names)
+
+
 def in_light(colors: np.ndarray) -> np.ndarray:
     """What glTF's COLOR_0 has to be of sRGB 0..255: linear (2.0, 3.9.2). trimesh gives its numbers as they are."""
     return 255 * np.where(colors <= 0.04045 * 255, colors / 255 / 12.92, ((colors / 255 + 0.055) / 1.055) ** 2.4)

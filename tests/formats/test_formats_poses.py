@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.colmap import write_colmap_model
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.names import stem
 from msgs_slam.formats.poses import read_poses
 from msgs_slam.formats.trajectory import write_tum
 from tests.colmap_models import posed_images
@@ -120,7 +121,7 @@ def test_what_apps_on_phones_write_is_in_metres(
         ("frame_00000.json", '{"cameraPoseARFrame": [1, 2]}', "sixteen numbers"),
         ("metadata.json", '{"poses": [[0, 0, 0, 1]]}', "seven numbers"),
         ("odometry.csv", "timestamp, frame, x\n0, 0, 1\n", "no column y"),
-        ("odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw\n0, 0, a, 0, 0, 0, 0, 0, 1\n", "than numbers"),
+        ("odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw\n0, 0, a, 0, 0, 0, 0, 0, 1\n", "must be a number"),
     ],
 )
 def test_damaged_files_of_apps_are_refused(name: str, text: str, what: str, tmp_path: Path) -> None:
@@ -146,7 +147,7 @@ def test_all_layouts_say_the_same(
 ) -> None:
     found = read_poses(write(tmp_path, made()))
     np.testing.assert_allclose(found.world_from_cam, made(), atol=1e-6)
-    assert found.names == (tuple(f"frame_{i:03d}" for i in range(5)) if is_named else ())
+    assert tuple(map(stem, found.names)) == (tuple(f"frame_{i:03d}" for i in range(5)) if is_named else ())
     assert (found.times is not None, found.is_metric) == (is_timed, is_metric)
     if found.times is not None:
         np.testing.assert_allclose(found.times, 10 + np.arange(5) / 30)
@@ -214,7 +215,99 @@ def test_a_folder_without_poses_and_a_name_twice_are_refused(tmp_path: Path) -> 
     with pytest.raises(InputError, match="no such file"):
         read_poses(tmp_path / "nowhere")
     frame = {"transform_matrix": np.eye(4).tolist()}
-    frames = [frame | {"file_path": f"{folder}/0.jpg"} for folder in ("left", "right")]
+    frames = [frame | {"file_path": f"{folder}/0.jpg"} for folder in ("left", "right", "left")]
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
-    with pytest.raises(InputError, match="two poses are of images called '0'"):
+    with pytest.raises(InputError, match="two poses are of images called 'left/0"):
         read_poses(tmp_path / "transforms.json")
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames[:2]}))
+    assert read_poses(tmp_path / "transforms.json").names == ("left/0.jpg", "right/0.jpg")
+
+
+def _row(i: int, pose: NDArray[np.float64], order: str) -> list[str]:
+    numbers = dict(zip("xyz", pose[:3, 3], strict=True)) | {"t": 10 + i / 30, "i": i + 1}
+    numbers |= dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(pose[:3, :3]).as_quat(), strict=True))
+    return [f"{numbers[key]:.9f}" if key != "i" else str(i + 1) for key in order.split()]
+
+
+@pytest.mark.parametrize(
+    ("headings", "order", "divider"),
+    [
+        ("", "t x y z qx qy qz qw", ";"),
+        ("", "t x y z qx qy qz qw", "\t"),
+        ("timestamp;tx;ty;tz;qx;qy;qz;qw", "t x y z qx qy qz qw", ";"),
+        ("timestamp tx ty tz qw qx qy qz", "t x y z qw qx qy qz", " "),
+        ("# timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []",
+         "t x y z qw qx qy qz", ","),
+        ("#timestamp x y z qx qy qz qw id", "t x y z qx qy qz qw i", " "),
+        ("", "t x y z qx qy qz qw i", " "),
+    ],
+)  # fmt: skip
+def test_a_table_is_read_by_its_headings_whatever_divides_it(
+    headings: str, order: str, divider: str, tmp_path: Path
+) -> None:
+    rows = [divider.join(_row(i, pose, order)) for i, pose in enumerate(made())]
+    text = "\n".join([headings, *rows] if headings else rows)
+    for name in ("poses.txt", "poses.csv"):
+        (tmp_path / name).write_text(text.replace(".", ",") if divider == ";" else text)
+        found = read_poses(tmp_path / name)
+        np.testing.assert_allclose(found.world_from_cam, made(), atol=1e-6)
+        np.testing.assert_allclose(found.times, 10 + np.arange(5) / 30, atol=1e-6)
+
+
+def test_a_table_may_name_images(tmp_path: Path) -> None:
+    rows = [[f"IMG {i}.jpg", *_row(i, pose, "x y z qx qy qz qw")] for i, pose in enumerate(made())]
+    text = "\n".join(["Name,x,y,z,qx,qy,qz,qw", *(",".join(row) for row in rows)])
+    (tmp_path / "poses.csv").write_text(text)
+    found = read_poses(tmp_path / "poses.csv")
+    np.testing.assert_allclose(found.world_from_cam, made(), atol=1e-6)
+    assert (found.names, found.times) == (tuple(f"IMG {i}.jpg" for i in range(5)), None)
+
+
+def test_rows_without_a_frame_are_lost(tmp_path: Path) -> None:
+    path = stray(tmp_path, made())
+    path.write_text(path.read_text().replace(" 000001,", " nan,").replace(" 000002,", " inf,"))
+    found = read_poses(path)
+    assert np.isfinite(found.world_from_cam).all(axis=(1, 2)).tolist() == [True, False, False, True, True]
+    assert (found.names[3], found.lost) == ("000003", 2)
+
+
+def opensfm(folder: Path, poses: Poses) -> Path:
+    shots = {}
+    for i, pose in enumerate(np.linalg.inv(poses)):
+        turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec().tolist()
+        shots[f"frame_{i:03d}.jpg"] = {"rotation": turn, "translation": pose[:3, 3].tolist(), "camera": "v2"}
+    parts = [{"cameras": {}, "shots": {}}, {"cameras": {}, "shots": shots}]
+    (folder / "reconstruction.json").write_text(json.dumps(parts))
+    return folder / "reconstruction.json"
+
+
+def metashape(folder: Path, poses: Poses) -> Path:
+    cameras = [
+        f"<camera id='{i}' label='frame_{i:03d}'><transform>{' '.join(map(str, pose.ravel()))}</transform></camera>"
+        for i, pose in enumerate(poses)
+    ]
+    text = f"<document><chunk><cameras>{''.join(cameras)}<camera id='9' label='x'/></cameras></chunk></document>"
+    (folder / "cameras.xml").write_text(text)
+    return folder / "cameras.xml"
+
+
+@pytest.mark.parametrize("write", [opensfm, metashape])
+def test_poses_of_photogrammetry(write: Callable[[Path, Poses], Path], tmp_path: Path) -> None:
+    found = read_poses(write(tmp_path, made()))
+    np.testing.assert_allclose(found.world_from_cam, made(), atol=1e-6)
+    assert tuple(map(stem, found.names)) == tuple(f"frame_{i:03d}" for i in range(5))
+    assert not found.is_metric
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "what"),
+    [
+        ("rc.csv", "#name,x,y,alt,heading,pitch,roll,f\n0.jpg,1,2,3,4,5,6,7\n", "as RealityScan and Metashape"),
+        ("cameras.sfm", "{}", "run its node ExportColmap"),
+        ("cameras.xml", "<document><chunk/></document>", "no <camera> with a label"),
+    ],
+)
+def test_what_is_not_read_is_named_with_the_export_that_is(name: str, text: str, what: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=what):
+        read_poses(tmp_path / name)

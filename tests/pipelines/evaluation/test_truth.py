@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.trajectory import read_tum
-from msgs_slam.pipelines.evaluation.truth import absolute_error, associate, relative_error
-from tests.matrices import random_poses
+from msgs_slam.formats.datasets import open_sequence
+from msgs_slam.formats.images import write_rgb
+from msgs_slam.formats.trajectory import read_tum, write_tum
+from msgs_slam.pipelines.evaluation.truth import absolute_error, associate, relative_error, true_trajectory
+from tests.matrices import random_poses, write_matrices
 
 
 @pytest.mark.parametrize(
@@ -29,6 +31,21 @@ def test_figures_of_evo_on_recorded_trajectories(
     assert (found.rmse, found.mean, found.max) == pytest.approx(sim3, abs=1e-6)
     rigid = absolute_error(poses[i, :3, 3], true_poses[j, :3, 3], with_scale=False).statistics
     assert rigid.rmse == pytest.approx(se3, abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["matrices", "TUM"])
+def test_a_trajectory_that_is_denser_than_the_images_is_read_in_every_form(kind: str, tmp_path: Path) -> None:
+    poses, times = random_poses(9, 3), np.arange(9) / 10
+    for i in range(0, 9, 3):
+        write_rgb(tmp_path / "rgb" / f"{i}.png", np.zeros((12, 16, 3), np.uint8))
+    (tmp_path / "timestamps.txt").write_text("".join(f"{t}\n" for t in times))
+    if kind == "TUM":
+        write_tum(tmp_path / "traj.txt", times, poses)
+    else:
+        write_matrices(tmp_path / "traj.txt", poses)
+    found_times, found = true_trajectory(open_sequence(tmp_path))
+    np.testing.assert_allclose(found_times, times)
+    np.testing.assert_allclose(found, poses, atol=1e-8)
 
 
 @pytest.mark.parametrize("with_scale", [True, False])

@@ -42,6 +42,41 @@ def test_files_that_say_the_same(name: str, text: str, tmp_path: Path) -> None:
     assert read_intrinsics(str(tmp_path / name), 640, 480) == Camera(640, 480, 525, 526, 320, 240)
 
 
+_METASHAPE = """<document><chunk><sensors><sensor id="0" label="x"><resolution width="640" height="480"/>
+<calibration class="initial"><resolution width="640" height="480"/><f>900</f></calibration>
+<calibration type="frame" class="adjusted"><resolution width="640" height="480"/><f>526</f><cx>3</cx><cy>-2</cy>
+<k1>-0.1</k1><k2>0.02</k2><k3>0.003</k3><p1>0.001</p1><p2>0.002</p2><b1>-1</b1></calibration></sensor></sensors></chunk>
+</document>"""
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "lens"),
+    [
+        ("cameras.xml", _METASHAPE, (-0.1, 0.02, 0.002, 0.001, 0.003)),
+        ("calib.xml", "<?xml version='1.0'?><calibration><projection>frame</projection><width>640</width>"
+         "<height>480</height><f>526</f><cx>3</cx><cy>-2</cy><b1>-1</b1></calibration>", (0.0, 0.0, 0.0, 0.0)),
+        ("cameras.json", '{"v2 x": {"projection_type": "brown", "width": 640, "height": 480, "focal_x": 0.8203125, '
+         '"focal_y": 0.821875, "c_x": 0.0046875, "c_y": -0.003125, "k1": -0.1, "p2": 0.001}}', (-0.1, 0, 0, 0.001)),
+        ("cameras.sfm", '{"intrinsics": [{"width": "640", "height": "480", "sensorWidth": "36", "type": "radial3", '
+         '"focalLength": "29.53125", "pixelRatio": "0.9980988593155894", "principalPoint": ["3", "-2"], '
+         '"distortionParams": ["-0.1", "0.02", "0.003"]}]}', (-0.1, 0.02, 0.0, 0.0, 0.003)),
+    ],
+)  # fmt: skip
+def test_cameras_of_photogrammetry(name: str, text: str, lens: tuple[float, ...], tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    camera = read_intrinsics(str(tmp_path / name), 640, 480)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((525, 526, 323, 238))
+    assert camera.distortion == pytest.approx(lens)
+
+
+def test_record3d_states_a_camera_for_each_image(tmp_path: Path) -> None:
+    each = '"perFrameIntrinsicCoeffs": [[524, 525, 320, 240], [525, 526, 320, 240], [526, 527, 320, 240]]'
+    for matrix in ('"K": [525, 0, 0, 0, 526, 0, 320, 240, 1], ', ""):
+        (tmp_path / "metadata.json").write_text(f'{{{matrix}"w": 640, "h": 480, {each}}}')
+        camera = read_intrinsics(str(tmp_path / "metadata.json"), 640, 480)
+        assert (camera.fx, camera.fy) == (525, 526)
+
+
 @pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"])
 def test_cameras_txt_projects_as_pycolmap_does(model: str, tmp_path: Path) -> None:
     theirs = pycolmap.Camera.create_from_model_name(1, model, 500.0, 640, 480)

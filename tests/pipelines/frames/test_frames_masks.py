@@ -1,5 +1,6 @@
 """The whole stage with masks: something large that moves by itself leaves no trace."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,12 +13,15 @@ import pytest
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_grey_png, read_rgb, write_grey_png, write_rgb
+from msgs_slam.pipelines.config import Config, FramesConfig
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.findings import warn_of_people
+from msgs_slam.pipelines.frames.masks import mask_inputs, masks_for
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.run.files import SPARSE
 from msgs_slam.pipelines.sfm.driver import Structure
+from msgs_slam.pipelines.source.opening import open_source
 from tests.pipelines.frames.conftest import HEIGHT, WALK_FRAMES, WIDTH, Walk, bluish, render, sideways
 from tests.pipelines.frames.test_frames_stage import digests
 from tests.pipelines.proxy.tiny_tflite import blue_people
@@ -155,3 +159,37 @@ def test_masks_that_cost_more_than_a_third_of_the_matches_are_warned_of(
     assert all(part in message for part, message in zip(said, context.warnings, strict=True))
     warn_of_people(context, None, structure)
     assert len(context.warnings) == len(said)
+
+
+def _masked_data_set(folder: Path) -> None:
+    """Two cameras' folders with images of equal names; the mask of each image of the first covers its left half."""
+    frames = []
+    for i, name in enumerate(("cam_a/0.png", "cam_b/0.png", "cam_b/1.png")):
+        image = np.random.default_rng(i).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+        write_rgb(folder / "images" / name, image)
+        frames.append({"file_path": f"images/{name}", "transform_matrix": np.eye(4).tolist()})
+        if name.startswith("cam_a"):
+            kept = np.full((48, 64), 255, np.uint8)
+            kept[:, :32] = 0
+            write_grey_png(folder / "masks" / name, kept)
+            frames[-1]["mask_path"] = f"masks/{name}"
+    (folder / "transforms.json").write_text(json.dumps({"fl_x": 50, "frames": frames}))
+
+
+def test_masks_of_a_data_set_are_used_and_those_of_the_user_win(tmp_path: Path) -> None:
+    _masked_data_set(tmp_path)
+    source = open_source(tmp_path)
+    found = masks_for(Config(), source).left_out(0, 64, 48)
+    assert found is not None
+    assert (found[:, :32].all(), found[:, 32:].any()) == (True, False)
+    assert masks_for(Config(), source).left_out(1, 64, 48) is None
+    before = mask_inputs(tmp_path, Config())
+    write_grey_png(tmp_path / "masks" / "cam_a" / "0.png", np.zeros((48, 64), np.uint8))
+    assert before is not None
+    assert mask_inputs(tmp_path, Config()) != before
+    write_grey_png(tmp_path / "own" / "cam_b" / "0.png.png", np.zeros((48, 64), np.uint8))
+    own = masks_for(Config(frames=FramesConfig(masks=str(tmp_path / "own"))), source)
+    assert [own.left_out(i, 64, 48) is None for i in range(3)] == [True, False, True]
+    write_grey_png(tmp_path / "masks" / "cam_a" / "0.png", np.zeros((24, 32), np.uint8))
+    with pytest.raises(InputError, match="is 32x24, the images are 64x48"):
+        masks_for(Config(), source)

@@ -103,6 +103,53 @@ def test_tracks_are_read_and_damage_is_refused(tmp_path: Path) -> None:
             read_track(tmp_path / "bad.csv")
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "altitude"),
+    [
+        ("geo.txt", "EPSG:4326\nIMG_1.jpg 13.0 55.0 30 0 0 0\nIMG_2.jpg 13.1 55.1 31 0 0 0\n", 31),
+        ("a.csv", "filename,latitude,longitude,altitude\nIMG_1.JPG,55,13,30\nIMG_2.JPG,55.1,13.1,31\n", 31),
+        ("b.csv", "SourceFile;GPSLatitude;GPSLongitude\n./x/IMG_1.jpg;55,0;13,0\n./x/IMG_2.jpg;55,1;13,1\n", np.nan),
+        ("c.txt", "#CoordinateSystem: WGS84\n#Label,X/Longitude,Y/Latitude,Z/Altitude\nIMG_1,13,55,30\n"
+         "IMG_2,13.1,55.1,31", 31),
+    ],
+)  # fmt: skip
+def test_a_table_of_images_is_read_by_their_names(name: str, text: str, altitude: float, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    found = read_track(tmp_path / name).of(["img_2.jpg", "IMG_3.jpg"])
+    np.testing.assert_allclose(found, [[55.1, 13.1, altitude], [np.nan] * 3])
+
+
+def test_a_table_in_metres_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "geo.txt").write_text("WGS84 UTM 32N\nIMG_1.jpg 500000 5300000 30\nIMG_2.jpg 500001 5300001 31\n")
+    with pytest.raises(InputError, match="convert it to EPSG:4326"):
+        read_track(tmp_path / "geo.txt")
+
+
+@pytest.mark.parametrize("longitude", ["longitude", "longtitude "])
+def test_a_drones_subtitles_are_a_track(longitude: str, tmp_path: Path) -> None:
+    blocks = (
+        f"{i + 1}\n00:01:0{i},500 --> 00:01:0{i + 1},500\n<font>FrameCnt: {i}\n[iso: 100] [latitude: 55.{i}] "
+        f"[{longitude}: 13.{i}] [rel_alt: 2.0 abs_alt: 3{i}.0]</font>\n\n"
+        for i in range(3)
+    )
+    (tmp_path / "DJI_0001.SRT").write_text("".join(blocks))
+    track = read_track(tmp_path / "DJI_0001.SRT")
+    assert track.times.tolist() == [60.5, 61.5, 62.5]
+    np.testing.assert_allclose(track.degrees, [[55, 13], [55.1, 13.1], [55.2, 13.2]])
+    assert track.altitude.tolist() == [30, 31, 32]
+
+
+def test_a_track_may_cross_the_date_line(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("time,lat,lon\n0,10,179.9\n2,10,-179.9\n4,10,-179.5\n")
+    found = read_track(tmp_path / "a.csv").at(np.array([0.5, 1.5, 3.0]), 2.0)[:, 1]
+    np.testing.assert_allclose(found, [179.95, -179.95, -179.7])
+
+
+def test_waypoints_are_a_track_where_there_is_no_other(tmp_path: Path) -> None:
+    (tmp_path / "a.gpx").write_bytes(_gpx(_point(1) + _point(2)).replace(b"trkpt", b"wpt"))
+    assert read_track(tmp_path / "a.gpx").degrees[:, 0].tolist() == [51, 52]
+
+
 def _gpx(points: str, head: str = "") -> bytes:
     return f"{head}<gpx xmlns='http://www.topografix.com/GPX/1/1'><trk><trkseg>{points}</trkseg></trk></gpx>".encode()
 
