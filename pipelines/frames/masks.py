@@ -90,7 +90,7 @@ class FrameMasks:
 
     @property
     def judged(self) -> dict[str, int] | None:
-        """How many regions of keyframes the networks name, how many of them stand still and how many move for sure, and
+        """Counts of the regions of keyframes that the networks name, of those that stand still and that move for sure, and
         the `matches` of keyframes with all of them; None before `leave_out`."""
         return read_json(self._table) if self._table.exists() else None
 

@@ -215,7 +215,7 @@ def frame_interval(times: Array, numbers: NDArray[np.int64]) -> float:
 
 @dataclass(frozen=True)
 class ReadoutEvidence:
-    """What speaks for a readout: by what share of the robust cost of held-out observations it is better than a global
+    """Evidence for a readout: by what share of the robust cost of held-out observations it is better than a global
     shutter, and by what factor it changes the scale of one stretch of the path against another."""
 
     held_out_gain: float
