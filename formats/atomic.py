@@ -85,7 +85,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
             raise RecoverableError(
                 f"{os.fsdecode(error.filename)}: {error.strerror}, while writing {path.name}: check its rights"
             ) from error
-        raise _explained(error, path) from error
+        raise explained(error, path) from error
     finally:
         with suppress(OSError):  # what the block raised says more
             temporary.unlink(missing_ok=True)
@@ -138,8 +138,8 @@ def _is_of_another(error: OSError, path: Path, temporary: Path) -> bool:
     return Path(os.fsdecode(error.filename)) not in (path, temporary, *path.parents)
 
 
-def _explained(error: OSError, path: Path) -> Exception:
-    """The same failure in the user's words, where the user can do something about it."""
+def explained(error: OSError, path: Path) -> Exception:
+    """Return the failure to write `path` in words of the user, where the user can do something about it."""
     if is_disk_full(error, path.parent):
         return DiskFullError(
             f"disk full while writing {path.name} ({error.strerror or 'cut short'}), "

@@ -57,8 +57,8 @@ def write_colmap_model(folder: Path, model: ColmapModel) -> None:
     """Write cameras, images and points3D, binary and text, of images by one PINHOLE camera.
 
     Ids in the files count from 1, in the order given. Each point's error is the mean reprojection error of its
-    observations. COLMAP's text format has no way to write blanks in a name: such names are whole in the binary files
-    only.
+    observations, -1 without any. COLMAP's text format has no way to write blanks in a name: such names are whole in
+    the binary files only.
 
     Raises ValueError for shapes or indices that do not fit together, InputError when the disk refuses.
     """
@@ -202,7 +202,7 @@ def _camera(model: ColmapModel) -> tuple[int, int, float, float, float, float]:
 
 
 def _point_errors(model: ColmapModel) -> NDArray[np.float64]:
-    """(P,) mean reprojection error in pixels, 0 for a point without observations."""
+    """(P,) mean reprojection error in pixels, -1 for a point without observations, as COLMAP has it."""
     _, _, fx, fy, cx, cy = _camera(model)
     points, obs_point, obs_xy = model.points, model.obs_point, model.obs_xy
     distance = np.zeros(len(obs_xy))
@@ -213,7 +213,8 @@ def _point_errors(model: ColmapModel) -> NDArray[np.float64]:
             projected = in_cam[:, :2] / in_cam[:, 2:] * [fx, fy] + [cx, cy]
         distance[rows] = np.nan_to_num(np.linalg.norm(projected - obs_xy[rows], axis=1), nan=0.0, posinf=0.0)
     counts = np.bincount(obs_point, minlength=len(points))
-    return np.bincount(obs_point, distance, minlength=len(points)) / np.maximum(counts, 1)
+    total = np.bincount(obs_point, distance, minlength=len(points))
+    return np.where(counts > 0, total / np.maximum(counts, 1), -1.0)
 
 
 def _cameras_text(camera: tuple[int, int, float, float, float, float]) -> str:

@@ -254,6 +254,13 @@ def write_textured_glb(path: Path, mesh: TexturedMesh, class_names: tuple[str, .
     write_primitive(path, parts, {"material": 0}, class_names, {"name": "mesh"}, extras, [UNLIT], picture)
 
 
+def has_texture(path: Path) -> bool:
+    """Return whether a mesh by `write_textured_glb` or `write_mesh_glb` has a texture. Raises InputError for another
+    file."""
+    with parsing(path, "mesh", "export it again"):
+        return "textures" in glb_parts(read_bytes(path))[0]
+
+
 def read_textured_glb(path: Path) -> TexturedMesh | None:
     """Read a mesh by `write_textured_glb`, every corner a vertex of its own; None where it has no texture, as those by
     `write_mesh_glb`. Raises InputError for another file."""

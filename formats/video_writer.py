@@ -2,6 +2,7 @@
 
 import errno
 import os
+import tempfile
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from itertools import chain
@@ -87,7 +88,7 @@ def write_browser_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: fl
 
     Raises InputError where there is no frame.
     """
-    codec = codec or best_codec(path.parent)
+    codec = codec or best_codec()
     if codec == H264:
         _write_h264(path, frames, fps)
     else:
@@ -95,17 +96,14 @@ def write_browser_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: fl
     return codec
 
 
-def best_codec(folder: Path) -> str:
-    """Return the first of H.264, VP9 and MPEG-4 part 2 that can be written here; tried in `folder`."""
+def best_codec() -> str:
+    """Return the first of H.264, VP9 and MPEG-4 part 2 that can be written here."""
     if _has_x264():
         return H264
-    folder.mkdir(parents=True, exist_ok=True)
-    with atomic_path(folder / ".codec.mp4") as trial:
-        writer = cv2.VideoWriter(str(trial), cv2.VideoWriter.fourcc(*"vp09"), 10.0, (64, 64))
+    with tempfile.TemporaryDirectory() as folder:
+        writer = cv2.VideoWriter(str(Path(folder) / "trial.mp4"), cv2.VideoWriter.fourcc(*"vp09"), 10.0, (64, 64))
         found = writer.isOpened()
         writer.release()
-        trial.touch()
-    (folder / ".codec.mp4").unlink(missing_ok=True)
     return VP9 if found else MPEG4
 
 

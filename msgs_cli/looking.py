@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from .options import RUN_ARGUMENT, open_run
+from .options import OVERWRITE, RUN_ARGUMENT, open_run
 from .output import Output, on_sigterm, say, verbosity_options
 
 
@@ -75,23 +75,22 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | No
     "--to", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Default: report.html in the run."
 )
 @click.option("--pdf", is_flag=True, help="Also write a PDF; needs Chromium or Chrome.")
+@OVERWRITE
 @verbosity_options
-def report(run_path: Path, to: Path | None, pdf: bool, output: Output) -> None:
+def report(run_path: Path, to: Path | None, pdf: bool, overwrite: bool, output: Output) -> None:
     """Write one HTML file that says what was found, how good it is, and what to film better."""
     if to is not None and to.suffix.lower() == ".pdf":
         raise click.UsageError(
             f"--to {to}: it names the HTML file, {to.with_suffix('.html')}; with --pdf the PDF is made beside it"
         )
     run = open_run(run_path)
-    from ..pipelines.evaluation.html import find_browser, print_pdf
+    from ..pipelines.evaluation.html import find_browser
     from ..pipelines.evaluation.report import write_report
 
     browser = find_browser() if pdf else ""
     with on_sigterm(signal.SIG_DFL):
-        made = [write_report(run, to, output.progress())]
-        if pdf:
-            made.append(made[0].with_suffix(".pdf"))
-            print_pdf(made[0], made[1], browser)
+        page = write_report(run, to, output.progress(), browser, overwrite)
+    made = [page, page.with_suffix(".pdf")] if pdf else [page]
     for path in made:
         say(path)
     output.report_result(report=made[0], **dict(zip(["pdf"], made[1:], strict=False)))
@@ -132,10 +131,11 @@ class Size(click.ParamType):
 @click.option(
     "--size", type=Size(), metavar="WIDTHxHEIGHT", help="Pixels of the images. Default: those of the run's frames."
 )
+@OVERWRITE
 @verbosity_options
 def render(
     source: Path, target: Path, kind: str, camera_path: str, fps: float | None, size: tuple[int, int] | None,
-    output: Output,
+    overwrite: bool, output: Output,
 ) -> None:  # fmt: skip
     """Render the map of RUN along a camera path, or any splat FILE (.ply, .spz, .glb, .splat) along an orbit or a
     recorded path, into a video or a folder of images.
@@ -151,9 +151,9 @@ def render(
 
     with on_sigterm(signal.SIG_DFL):
         if run is None:
-            made = render_file(source, target, fps, output.progress(), size, camera_path, output.report)
+            made = render_file(source, target, fps, output.progress(), size, camera_path, output.report, overwrite)
         else:
-            made = render_run(run, target, kind, camera_path, fps, output.progress(), size, output.report)
+            made = render_run(run, target, kind, camera_path, fps, output.progress(), size, output.report, overwrite)
     say(made)
     output.report_result(video=made)
 

@@ -22,6 +22,7 @@ from .json_lines import Interrupted, is_asked_for, json_stderr
 from .models import doctor, models
 from .options import (
     FOLDER,
+    OVERWRITE,
     RUN_ARGUMENT,
     UNTIL,
     chosen_config,
@@ -263,12 +264,14 @@ def extend(run_path: Path, videos: tuple[Path, ...], output: Output) -> None:
     help="Write one kind of file only; nerfstudio's comes with colmap. Default: all.",
 )  # fmt: skip
 @click.option("--to", type=FOLDER, metavar="DIR", help="Where to write. Default: RUN/export.")
+@OVERWRITE
 @settings_options
 @verbosity_options
 def export(
     run_path: Path,
     only: str | None,
     to: Path | None,
+    overwrite: bool,
     config_file: Path | None,
     overrides: tuple[str, ...],
     output: Output,
@@ -281,23 +284,25 @@ def export(
     Other settings than the run's own (--set export.voxel=0.02, --set export.spz=true) need --to; `msgs-slam resume RUN
     --set ...` changes them in the run itself.
     """
-    if (config_file or overrides) and to is None:
-        raise click.UsageError("add --to DIR: files of other settings (--set, --config) do not go into the run")
+    if (config_file or overrides) and (to is None or to.resolve() == (run_path / "export").resolve()):
+        raise click.UsageError(
+            "add --to DIR, a folder outside of the run: files of other settings (--set, --config) do not go into it"
+        )
     if others := [text for text in overrides if not text.startswith("export.")]:
         raise click.UsageError(
             f"--set {others[0]}: an export has the settings of [export] alone; of the rest of the run: "
             f"msgs-slam resume {quoted(run_path)} --set {quoted(others[0])}"
         )
-    from ..pipelines.read_config import load_config
+    from ..pipelines.read_config import load_config, with_absolute_paths
     from ..pipelines.reconstruct import made_with
 
     run = open_run(run_path)
     from ..pipelines.export.stage import export_run
 
-    settings = load_config(config_file, overrides, base=made_with(run)).export
+    settings = with_absolute_paths(load_config(config_file, overrides, base=made_with(run))).export
     kind, folder = _COMES_WITH.get(only or "", only), to or run.stage("export")
     with on_sigterm(signal.SIG_DFL):
-        written = export_run(run, folder, kind, output.progress(), settings)
+        written = export_run(run, folder, kind, output.progress(), settings, overwrite)
     for path in written:
         if not output.quiet:
             say(path)

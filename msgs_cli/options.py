@@ -33,6 +33,12 @@ RUN_ARGUMENT = click.argument("run_path", metavar="RUN", type=click.Path(path_ty
 _HOLD_OUT, _QUALITY = "mapping.hold_out", "run.quality"
 UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], help="Stop after this stage.")
 
+OVERWRITE = click.option(
+    "--overwrite", is_flag=True,
+    help="Replace files in the way that msgs-slam has not written, or that were changed since. Without it the command "
+    "is refused.",
+)  # fmt: skip
+
 
 def settings_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options --config and --set to a command."""

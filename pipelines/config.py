@@ -347,6 +347,11 @@ class ExportConfig:
     planes: bool = setting(
         True, "the mesh's floors, walls and fronts straight: what no match confirms moves onto the planes beside it"
     )
+    image_side: int = setting(
+        1600,
+        "pixels on the long side of images/, read again from the source: at most its own, at least the frames'",
+        within=(16, 16384),
+    )
     scale: str = setting(
         "auto",
         "where metres are unknown, auto estimates how long a unit is, by a network and usual sizes; free does not",

@@ -17,7 +17,7 @@ from ..formats.errors import InputError
 from ..formats.gaussians import GaussianCloud, isotropic_cloud
 from .config import Config
 from .geometry.se3 import Similarity
-from .geometry.sparse_model import SparseModel
+from .geometry.sparse_model import FrameObservations, SparseModel
 from .render.gaussian_map import GaussianMap
 from .run.files import (
     CALIBRATION,
@@ -26,6 +26,7 @@ from .run.files import (
     EVERY_FRAME,
     EXPOSURE,
     FIGURES,
+    FRAME_OBSERVATIONS,
     FRAMES,
     MAP,
     METRES,
@@ -129,6 +130,13 @@ class Outcome:
             if (model := self.run.find(SPARSE, stage)) is not None:
                 return model if self.move is None else model.moved(self.move)
         return None
+
+    def load_observations(self, sparse: SparseModel) -> FrameObservations | None:
+        """Load where frames that are no keyframes see the points of `sparse`, the run's own `load_sparse`; None where
+        the run has kept nothing of it."""
+        if (seen := self.run.find(FRAME_OBSERVATIONS)) is None:
+            return None
+        return seen.carried(self.run.load(SPARSE, "tracking"), sparse)
 
     def moved(self, other_from_run: Similarity) -> Outcome:
         """Transform cameras, map and points into another world. Raises ValueError where that has been done before."""

@@ -268,15 +268,20 @@ def write_transforms(
     image_paths: tuple[str, ...] | list[str],
     world_from_cam: NDArray[np.float64],
     ply_path: str | None = None,
+    mask_paths: tuple[str, ...] | list[str] = (),
 ) -> None:
     """Write a transforms.json of one pinhole camera.
 
     image_paths: N, relative to the file; world_from_cam (N, 4, 4), camera axes x right, y down, z forward, which
-    are turned into OpenGL's; the world stays as it is. `ply_path` names a point cloud to start a splat from.
+    are turned into OpenGL's; the world stays as it is. `ply_path` names a point cloud to start a splat from;
+    mask_paths: N, or none, masks of the images, black where these are not to be learned from.
     Raises ValueError for shapes that do not fit, InputError when the disk refuses.
     """
-    if world_from_cam.shape != (len(image_paths), 4, 4):
-        raise ValueError(f"write_transforms: got {len(image_paths)} images and poses {world_from_cam.shape}")
+    if world_from_cam.shape != (len(image_paths), 4, 4) or len(mask_paths) not in (0, len(image_paths)):
+        raise ValueError(
+            f"write_transforms: got {len(image_paths)} images, {len(mask_paths)} masks, poses {world_from_cam.shape}"
+        )
+    masks = [{"mask_path": name} for name in mask_paths] or [{}] * len(image_paths)
     matrices = world_from_cam @ OPENCV_FROM_OPENGL
     table: dict[str, object] = {
         "camera_model": "OPENCV",
@@ -288,8 +293,8 @@ def write_transforms(
         "cy": float(cy),
         **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
         "frames": [
-            {"file_path": name, "transform_matrix": matrix.tolist()}
-            for name, matrix in zip(image_paths, matrices, strict=True)
+            {"file_path": name, **mask, "transform_matrix": matrix.tolist()}
+            for name, mask, matrix in zip(image_paths, masks, matrices, strict=True)
         ],
     }
     if ply_path is not None:

@@ -38,7 +38,8 @@ section{background:var(--card);border:1px solid var(--line);border-radius:12px;p
 .two{display:grid;grid-template-columns:repeat(auto-fill,minmax(440px,1fr));gap:14px}
 .plot{width:100%;height:auto;display:block}
 table{border-collapse:collapse;width:100%;font-size:14px}
-th,td{text-align:left;padding:6px 10px;border-bottom:1px solid var(--line);vertical-align:top;overflow-wrap:anywhere}
+th,td{text-align:left;padding:6px 10px;border-bottom:1px solid var(--line);vertical-align:top;overflow-wrap:break-word}
+td:last-child{overflow-wrap:anywhere}
 th{color:var(--soft);font-weight:600}
 img{max-width:100%;border-radius:6px;display:block}
 ul{margin:0;padding-left:20px}li{margin:4px 0}
@@ -54,7 +55,8 @@ code{background:#f3f4f6;padding:1px 5px;border-radius:4px;overflow-wrap:anywhere
 .legend span{color:var(--soft)}
 details{margin-top:10px}pre{white-space:pre-wrap;overflow-wrap:anywhere}
 @media (max-width:700px){.grid{grid-template-columns:repeat(2,1fr)}.two{grid-template-columns:1fr}
-main{padding:16px 8px 40px}section{padding:12px}th,td{padding:5px 4px;font-size:13px;min-width:5.6em}
+main{padding:16px 8px 40px}section{padding:12px}
+th,td{padding:5px 4px;font-size:13px;min-width:5.6em;overflow-wrap:anywhere}
 td:first-child,th:first-child{min-width:7.2em}pre{white-space:pre}}
 @media print{@page{margin:14mm}
 body{background:#fff;font-size:11px;print-color-adjust:exact;-webkit-print-color-adjust:exact}

@@ -12,18 +12,19 @@ from ...formats.atomic import write_text
 from ...formats.datasets.sequence import distortion_names
 from ...formats.mesh import read_textured_glb
 from ...formats.reading import read_bytes
-from ...formats.textfile import read_json
+from ...formats.textfile import read_json, read_text
 from ..config import Config, config_to_dict
 from ..export.extra.web_page import WEB_PAGE
-from ..export.readme import lengths, readme
+from ..export.images import IMAGES
+from ..export.readme import lengths
 from ..export.stage import on_earth
-from ..export.writers import IMAGES
 from ..geometry.sparse_model import SparseModel
 from ..outcome import Outcome, load_outcome, spread_sample
 from ..read_config import config_to_toml
 from ..run.files import FIGURES, LOOPS
 from ..run.folder import RunFolder, load_source
-from ..scene.world import FIRST, WORLD
+from ..run.target import LIST, Target
+from ..scene.world import WORLD
 from ..source.sharpness import at_most_wide
 from ..system.progress import Progress, SilentProgress
 from ..system.wording import figure_text, quoted
@@ -44,12 +45,21 @@ from .html import (
     legend,
     page,
     plot,
+    print_pdf,
     section,
     table,
 )
 from .image_quality import psnr
 from .views import depth_picture, depth_range, labels_on_photo, mesh_picture, render_outcome
-from .write import PATH_FROM_ABOVE, TABLE_HEADER, evaluation_rows, trajectory_plots, unit_name
+from .write import (
+    JUDGED,
+    PATH_FROM_ABOVE,
+    TABLE_HEADER,
+    evaluation_rows,
+    identity_of,
+    trajectory_plots,
+    unit_name,
+)
 
 MEASURED_VIEWS = 60
 SHOWN_VIEWS = 8
@@ -58,15 +68,35 @@ _ROWS = 3
 """Of four pictures, seen at once; the others unfold."""
 
 
-def write_report(run: RunFolder, path: Path | None = None, progress: Progress | None = None) -> Path:
+def write_report(
+    run: RunFolder,
+    path: Path | None = None,
+    progress: Progress | None = None,
+    browser: str = "",
+    overwrite: bool = False,
+) -> Path:
     """Write RUN/report.html, or `path`; returns where. What has not been done yet is left out.
 
-    Raises InputError for a run without poses.
+    browser: one that prints a PDF of it beside it, "" = none; overwrite: whether a file at `path` that is no earlier
+    report may be replaced. Raises InputError for a run without poses, or such a file.
     """
     outcome, target = load_outcome(run), path or run.report_file
+    names = {target.name, target.with_suffix(".pdf").name} if browser else {target.name}
+    place = Target(target.parent, overwrite or path is None)
+    with place.replacing(names.__contains__) as staged:
+        html = staged / target.name
+        write_text(html, _report(outcome, target, progress or SilentProgress()))
+        if browser:
+            print_pdf(html, html.with_suffix(".pdf"), browser)
+    return target
+
+
+def _report(outcome: Outcome, target: Path, progress: Progress) -> str:
+    """The HTML of the report that will be at `target`."""
+    run = outcome.run
     sparse, loops = outcome.load_sparse(), run.load(LOOPS) if "global_ba" in outcome.records else []
     capture = read_capture(outcome, sparse)
-    views = None if outcome.gaussian_map is None else render_views(outcome, progress or SilentProgress())
+    views = None if outcome.gaussian_map is None else render_views(outcome, progress)
     evaluation = read_json(run.evaluation_file) if run.evaluation_file.exists() else None
     body = "".join(
         [
@@ -78,15 +108,14 @@ def write_report(run: RunFolder, path: Path | None = None, progress: Progress | 
             _found_section(outcome, sparse, loops),
             _path_section(outcome),
             quality_section(outcome, capture, views),
-            "" if evaluation is None else _truth_section(evaluation, run),
-            *(_piece_section(piece, progress or SilentProgress()) for piece in outcome.pieces()),
+            "" if evaluation is None else truth_section(evaluation, outcome),
+            *(_piece_section(piece, progress) for piece in outcome.pieces()),
             _time_section(outcome),
             _export_section(outcome),
             _settings_section(outcome),
         ]
     )
-    write_text(target, page(f"{run.place.name} – report", body))
-    return target
+    return page(f"{run.place.name} – report", body)
 
 
 def _figures(outcome: Outcome) -> list[tuple[str, str]]:
@@ -225,7 +254,15 @@ def _path_section(outcome: Outcome) -> str:
     return section("Camera path", '<div class="two">', *trajectory_plots(outcome, None, upright), "</div>")
 
 
-def _truth_section(evaluation: dict[str, Any], run: RunFolder) -> str:
+def truth_section(evaluation: dict[str, Any], outcome: Outcome) -> str:
+    """The errors, of this very map only: an evaluation of what has been made again since would be read as of it."""
+    run, identity = outcome.run, identity_of(outcome)
+    if changed := [what for what, content in identity.items() if evaluation.get(JUDGED, {}).get(what) != content]:
+        return section(
+            "Compared with ground truth",
+            f"<p>The evaluation was made for earlier {' and '.join(changed)}: "
+            f"<code>msgs-slam evaluate {escape(quoted(run.root))} --truth PATH</code> makes it again.</p>",
+        )
     errors = np.array(evaluation.get("frame errors", []), np.float64).reshape(-1, 2)
     drawn = ""
     if len(errors):
@@ -259,8 +296,8 @@ def _export_section(outcome: Outcome) -> str:
     if "export" not in outcome.records:
         return section("Files for other programs", "<p>Not exported yet.</p>")
     files = [row for row in files_of_export(outcome.run) if Path(row[0]).parts[0] not in (IMAGES, "masks")]
-    notes = readme(outcome.run.find(WORLD) or FIRST, outcome.metres, outcome.metric)
-    notes = f"<pre>{escape(notes)}</pre>"
+    written = outcome.run.stage("export") / "README.txt"
+    notes = f"<pre>{escape(read_text(written))}</pre>" if written.is_file() else ""
     return section("Files for other programs", notes, table(("in export/", "size"), files))
 
 
@@ -270,6 +307,7 @@ def files_of_export(run: RunFolder) -> list[tuple[str, str]]:
     root = run.stage("export")
     wrong = {name: f"missing or damaged: msgs-slam resume {quoted(run.root)}" for name in run.damaged("export")}
     sizes = {p.relative_to(root).as_posix(): _size(p.stat().st_size) for p in root.rglob("*") if p.is_file()}
+    sizes.pop(LIST, None)
     return sorted((sizes | wrong).items())
 
 

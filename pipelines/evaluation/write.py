@@ -10,6 +10,7 @@ from ...formats.images import write_rgb
 from ...formats.textfile import write_json
 from ..geometry.se3 import Similarity, align_points
 from ..outcome import Outcome, load_outcome, spread_sample
+from ..run.files import MESH
 from ..run.folder import RunFolder
 from ..sfm.lens import FramePixels
 from ..system.progress import Progress
@@ -32,6 +33,8 @@ from .views import (
 Row = tuple[str, str, str]
 TABLE_HEADER: Row = ("what", "value", "of")
 
+JUDGED = "judged"
+"""Key of evaluation.json: the `identity_of` the outcome."""
 PATH_FROM_ABOVE, PATH_FROM_THE_SIDE = "trajectory_top.svg", "trajectory_side.svg"
 SHEET_VIEWS = 6
 TITLES = ("frame", "map", "depth of the map", "true depth", "error, white = 10 %", "labels of the map", "true labels")
@@ -50,7 +53,7 @@ def write_evaluation(
     anything is written.
     """
     outcome = load_outcome(run)
-    result = evaluate_outcome(outcome, truth, progress, max_views, class_map)
+    result = evaluate_outcome(outcome, truth, progress, max_views, class_map) | {JUDGED: identity_of(outcome)}
     folder = run.evaluation_file.parent
     write_json(run.evaluation_file, result)
     write_text(folder / "evaluation.md", evaluation_table(result))
@@ -61,6 +64,16 @@ def write_evaluation(
     if outcome.gaussian_map is not None:
         write_rgb(folder / "views.png", comparison_sheet(outcome, matched))
     return result
+
+
+def identity_of(outcome: Outcome) -> dict[str, str]:
+    """Return the checksums of the poses, the map and the mesh that an evaluation of the outcome is about."""
+    records = outcome.records
+    stages = {"poses": outcome.pose_stage, "map": outcome.map_stage}
+    identity = {what: records[stage].content for what, stage in stages.items() if stage}
+    if "export" in records and MESH in records["export"].files:
+        identity["mesh"] = records["export"].files[MESH][1]
+    return identity
 
 
 def trajectory_plots(outcome: Outcome, matched: MatchedTruth | None, upright: bool = False) -> tuple[str, str]:

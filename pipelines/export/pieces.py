@@ -30,19 +30,21 @@ from ..run.files import (
     save_frames,
 )
 from ..run.folder import RunFolder, load_records
+from ..scene.world import FIRST
 from ..system.progress import WithinStage
 from .writers import write_colmap, write_trajectory
 
 
 def write_pieces(context: StageContext) -> None:
     """Make the pieces, and write piece_2 and so on: each with all the files of an export, or with its poses."""
+    side = context.config.export.image_side
     for piece in make_pieces(context):
         if "export" in (records := load_records(piece)):
             for name in records["export"].files:
                 copy_file(piece.file("export", name), context.folder / piece.root.name / name)
         elif "tracking" in records:
             found = load_outcome(piece, context.device)
-            write_colmap(found, context.folder / piece.root.name)
+            write_colmap(found, FIRST, side, context.folder / piece.root.name, context.warn)
             write_trajectory(found, context.folder / piece.root.name)
 
 
@@ -50,8 +52,8 @@ def make_pieces(context: StageContext) -> list[RunFolder]:
     """Bring the pieces that tracking has found up to date, largest first, and remove those it no longer finds; a piece
     of which no map can be made is reported."""
     run, names = context.run, context.run.pieces("tracking")
-    for old in run.root.glob("piece_*"):
-        if old.name not in names:
+    for old in run.root.glob("piece_[0-9]*"):
+        if old.name not in names and RunFolder(old).manifest_file.exists():
             discard(old)
     records, made = load_records(run), []
     for name in names:

@@ -1,7 +1,9 @@
 """Stage 6: files for other programs."""
 
-import shutil
+import hashlib
+import tempfile
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,9 +15,10 @@ from ..config import ExportConfig
 from ..engine.stages import StageContext
 from ..networks.registry import metric_card
 from ..outcome import Outcome, load_outcome
-from ..run.ending import empty
 from ..run.files import METRES, SUBMAPS
 from ..run.folder import RunFolder
+from ..run.lock import locked
+from ..run.target import Target, read_list
 from ..scene.gps import world_on_earth
 from ..scene.metres import find_metres
 from ..scene.upright import find_upright
@@ -26,13 +29,14 @@ from ..system.progress import Progress, SilentProgress, log
 from ..types import Metres
 from .extra.floor_plan import write_floor_plan
 from .extra.meshes import write_collision, write_usd
-from .extra.tiles import TILES, TILESET, write_tiles
+from .extra.tiles import write_tiles
 from .extra.web_page import write_web_page
+from .images import IMAGES
 from .mesh import MeshJob, mesh_figures, write_meshes
 from .pieces import write_pieces
 from .readme import names_of
 from .writers import (
-    IMAGES,
+    files_in,
     write_colmap,
     write_notes,
     write_ply,
@@ -41,9 +45,6 @@ from .writers import (
     write_trajectory,
     write_world,
 )
-
-_SEVERAL = ("colmap", "ply", "mesh", "obj")
-"""The `EXPORTS` of more than one file."""
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -62,7 +63,7 @@ def run(context: StageContext) -> dict[str, Any]:
 
     # Poses and splats; of each disconnected component all that is known of it
     write_pieces(context)
-    write_all_but_mesh(outcome, world, settings, folder)
+    write_all_but_mesh(outcome, world, settings, folder, context.warn)
     if world.earth is not None:
         METRES.save(folder, metres)
     gaussians = len(outcome.require_map())
@@ -71,6 +72,7 @@ def run(context: StageContext) -> dict[str, Any]:
     outcome = replace(outcome, gaussian_map=None)
     release_free_memory()
     write_meshes(MeshJob(context, ("mesh",), folder, keep=True), outcome, world)
+    write_readme(outcome, world, folder, files_in(folder))
     mesh = mesh_blocks(folder / "mesh.ply")
     if mesh.face_count == 0:
         context.warn("the mesh is empty: no surface is seen by enough keyframes")
@@ -127,15 +129,36 @@ def find_world(outcome: Outcome, settings: ExportConfig) -> tuple[World, list[st
     return world, [*reasons, reason] if reason else reasons
 
 
-def write_all_but_mesh(outcome: Outcome, world: World, settings: ExportConfig, folder: Path) -> list[Path]:
-    """Web page, COLMAP model, PLYs, trajectory, notes; SPZ and GLB where the settings want them, tiles of a map that
-    was made in parts. `outcome` stands in `world`."""
-    paths = write_web_page(outcome, world, folder) + write_colmap(outcome, folder)
-    paths += write_ply(outcome, settings.sh_rest, folder)
-    paths += write_splats("spz", outcome, world, settings, folder) if settings.spz else []
-    paths += write_splats("glb", outcome, world, settings, folder) if settings.splat_glb else []
-    paths += write_tiles(outcome, world, folder) if outcome.run.load(SUBMAPS) else []
-    return paths + write_trajectory(outcome, folder) + write_notes(outcome, world, folder)
+def kinds_of_run(outcome: Outcome, settings: ExportConfig) -> list[str]:
+    """The `EXPORTS` that a finished run has: SPZ and GLB where the settings want them, tiles of a map in parts."""
+    asked = {"spz": settings.spz, "glb": settings.splat_glb, "tiles": bool(outcome.run.load(SUBMAPS))}
+    return ["html", "colmap", "ply", *(kind for kind, is_wanted in asked.items() if is_wanted), "tum", "mesh"]
+
+
+def write_all_but_mesh(
+    outcome: Outcome, world: World, settings: ExportConfig, folder: Path, warn: Callable[[str], None]
+) -> list[Path]:
+    """Write the `kinds_of_run` into a folder, but for the mesh and README.txt. `outcome` stands in `world`."""
+    writers = _writers(outcome, world, settings, folder, warn)
+    paths = [path for kind in kinds_of_run(outcome, settings) if kind != "mesh" for path in writers[kind]()]
+    return paths + write_notes(outcome, world, folder)
+
+
+def _writers(
+    outcome: Outcome, world: World, settings: ExportConfig, folder: Path, warn: Callable[[str], None] = log.warning
+) -> dict[str, Callable[[], list[Path]]]:
+    """What writes each of the `EXPORTS` but those of the mesh's own making, all from the same moved `outcome`."""
+    return {
+        "colmap": lambda: write_colmap(outcome, world, settings.image_side, folder, warn),
+        "ply": lambda: write_ply(outcome, world, settings.sh_rest, folder),
+        **{k: partial(write_splats, k, outcome, world, settings, folder) for k in ("spz", "sog", "glb")},
+        "tiles": lambda: write_tiles(outcome, world, folder),
+        "html": lambda: write_web_page(outcome, world, folder),
+        "collision": lambda: write_collision(outcome, world, folder),
+        "usd": lambda: write_usd(outcome, world, folder),
+        "floorplan": lambda: write_floor_plan(outcome, world, folder),
+        "tum": lambda: write_trajectory(outcome, folder),
+    }
 
 
 def export_run(
@@ -144,13 +167,37 @@ def export_run(
     only: str | None = None,
     progress: Progress | None = None,
     settings: ExportConfig | None = None,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Write one of the `EXPORTS`, or with None all, of a run into a folder; returns what was written.
 
-    Settings are the run's own where none are given. Raises InputError for a run without a map, and for a folder that
-    holds such files of somebody else, or the run's source.
+    Settings are the run's own where none are given. What is written takes the place of an earlier export; of other
+    files only where they may be overwritten (see `Target`). Nothing changes before all of it is made. Raises InputError
+    for a run without a map, for a folder that holds such files of somebody else, or the run's source, and for the run's
+    own export while another process works on the run.
     """
-    _require_own(run, folder, only)
+    is_own = folder.resolve() == run.stage("export").resolve()
+    if IMAGES in names_of([only] if only else None) and is_of_source(folder / IMAGES, run):
+        raise InputError(f"{folder / IMAGES} is the source of {run.root}: name another folder with --to")
+    with locked(run) if is_own else nullcontext():
+        outcome, world, settings = _exported(run, settings)
+        kinds = [only] if only else kinds_of_run(outcome, settings)
+        names = names_of(kinds, with_notes=not only)
+        manifest = run.manifest()
+        fixed = manifest.records["export"].files if is_own and manifest and "export" in manifest.records else {}
+        target = Target(folder, overwrite, "" if is_own else _origin(outcome, world), fixed)
+        with target.replacing(names.__contains__) as staged:
+            paths = _write_kinds(outcome, world, settings, staged, kinds, progress or SilentProgress())
+            paths += [write_world(outcome, world, staged)] if only else write_notes(outcome, world, staged)
+            if not (is_own and only):  # the README of the run's own folder is the stage's
+                stay = fixed if is_own else [n for n in read_list(folder) if n.partition("/")[0] not in names]
+                files = {name: folder / name for name in stay} | files_in(staged)
+                paths.append(write_readme(outcome, world, staged, files))
+    return [folder / path.relative_to(staged) for path in paths]
+
+
+def _exported(run: RunFolder, settings: ExportConfig | None) -> tuple[Outcome, World, ExportConfig]:
+    """The outcome of a run in the world of its exported files, that world, and the settings: the run's by default."""
     found = load_outcome(run)
     found.require_map()
     settings = settings or found.config.export
@@ -161,54 +208,31 @@ def export_run(
     outcome = on_earth(found.moved(world.exported_from_run), world)
     if outcome.metres is not None and outcome.metres.is_guess and settings.scale == "free":
         outcome = replace(outcome, metres=None)
-
-    def mesh(*kinds: str) -> list[Path]:
-        empty(scratch := folder / ".mesh")  # what a killed export has left
-        try:
-            config = replace(found.config, export=settings)
-            context = StageContext(run, Path(), config, scratch, progress or SilentProgress())
-            return write_meshes(MeshJob(context, kinds, folder), outcome, world)
-        finally:
-            shutil.rmtree(scratch, ignore_errors=True)
-
-    writers: dict[str, Callable[[], list[Path]]] = {
-        "colmap": lambda: write_colmap(outcome, folder),
-        "ply": lambda: write_ply(outcome, settings.sh_rest, folder),
-        **{k: partial(write_splats, k, outcome, world, settings, folder) for k in ("spz", "sog", "glb")},
-        "tiles": lambda: write_tiles(outcome, world, folder),
-        "html": lambda: write_web_page(outcome, world, folder),
-        "mesh": lambda: mesh("mesh"),
-        "obj": lambda: mesh("obj"),
-        "collision": lambda: write_collision(found, world, folder),
-        "usd": lambda: write_usd(found, world, folder),
-        "floorplan": lambda: write_floor_plan(found, folder),
-        "tum": lambda: write_trajectory(outcome, folder),
-    }
-    if only in (None, *_SEVERAL):  # by it the folder is known for an export's, should this be stopped
-        write_world(outcome, world, folder)
-    if only:
-        paths = [*writers[only](), write_world(outcome, world, folder)]
-        # The run's own folder has a README that tells of every kind.
-        own = folder.resolve() == run.stage("export").resolve()
-        return paths if own else [*paths, write_readme(outcome, world, folder, only)]
-    return write_all_but_mesh(outcome, world, settings, folder) + mesh("mesh")
+    return outcome, world, settings
 
 
-def _require_own(run: RunFolder, folder: Path, only: str | None) -> None:
-    """Nothing that the user has is overwritten: photographs, another program's data set, a README of his own."""
-    if folder.resolve() == run.stage("export").resolve():
-        return
-    names = names_of(only)
-    if IMAGES in names and is_of_source(folder / IMAGES, run):
-        raise InputError(f"{folder / IMAGES} is the source of {run.root}: name another folder with --to")
-    # Tiles that were stopped have no tileset yet.
-    entries = {name: folder / name for name in names} | {TILES: folder / TILES / TILESET}
-    taken = [name for name in names if entries[name].exists()]
-    if taken and not (folder / WORLD.name).is_file():
-        raise InputError(
-            f"{folder} holds {', '.join(taken)} already, which is of no export (without {WORLD.name}): name another "
-            "folder with --to"
-        )
+def _write_kinds(
+    outcome: Outcome, world: World, settings: ExportConfig, folder: Path, kinds: list[str], progress: Progress
+) -> list[Path]:
+    """Write some of the `EXPORTS`, those of the mesh by a scratch folder that is removed again."""
+    writers, paths = _writers(outcome, world, settings, folder), list[Path]()
+    for kind in kinds:
+        if kind in writers:
+            paths += writers[kind]()
+            continue
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            config = replace(outcome.config, export=settings)
+            context = StageContext(outcome.run, Path(), config, Path(scratch), progress)
+            paths += write_meshes(MeshJob(context, (kind,), folder), outcome, world)
+    return paths
+
+
+def _origin(outcome: Outcome, world: World) -> str:
+    """Identity of the map and of the world that the files show."""
+    records, move = outcome.records, world.exported_from_run
+    of_run = [records[stage].content for stage in (outcome.pose_stage, outcome.map_stage)]
+    numbers = [move.scale, *move.rotation.ravel().tolist(), *move.translation.tolist()]
+    return hashlib.sha256(" ".join([*of_run, *map(repr, numbers)]).encode()).hexdigest()
 
 
 def _kept_world(outcome: Outcome, settings: ExportConfig) -> World | None:

@@ -2,7 +2,7 @@
 
     1. its record, with the checksums of all results, is written into the unfinished folder: from here on it is finished
     2. snapshot and stamp are removed
-    3. the folder of an earlier result is renamed aside and removed
+    3. the folder of an earlier result is renamed aside and removed; what others have put into the export's is kept
     4. the unfinished folder takes the name of the stage
     5. the manifest names the stage
     6. the record in the folder is removed
@@ -21,9 +21,12 @@ from pathlib import Path
 from ...formats.errors import InputError
 from ...formats.reading import file_sha256, parsing
 from ...formats.textfile import read_json_object, write_json
+from ..config import STAGES
+from ..system.progress import log
 from .folder import RunFolder
 from .manifest import StageRecord, content_digest
 from .schema import dataclass_from_json
+from .target import LIST, keep_others
 
 FINGERPRINT, SNAPSHOT, RECORD = "fingerprint", "snapshot", ".record.json"
 """In an unfinished folder: the work that it belongs to, the folder of snapshots, the record of a stage that ended."""
@@ -31,7 +34,7 @@ FINGERPRINT, SNAPSHOT, RECORD = "fingerprint", "snapshot", ".record.json"
 
 def results(folder: Path) -> dict[str, tuple[int, str]]:
     """Relative path → (bytes, sha256) of every result in a stage's folder, finished or not."""
-    return checksums(folder, but=(FINGERPRINT, SNAPSHOT, RECORD))
+    return checksums(folder, but=(FINGERPRINT, SNAPSHOT, RECORD, LIST))
 
 
 def checksums(folder: Path, but: tuple[str, ...] = ()) -> dict[str, tuple[int, str]]:
@@ -66,9 +69,20 @@ def move_in(run: RunFolder, name: str) -> None:
         return
     shutil.rmtree(folder / SNAPSHOT, ignore_errors=True)
     (folder / FINGERPRINT).unlink(missing_ok=True)
+    if name == STAGES[-1]:
+        _keep_others(target, folder)
     discard(target)
     os.replace(folder, target)
     _flush_folder(run.root)
+
+
+def _keep_others(old: Path, new: Path) -> None:
+    """What people keep beside the exported files, and exports on request, stay when the stage is made again."""
+    record = dataclass_from_json(StageRecord, read_json_object(new / RECORD, limit=None))
+    if kept := keep_others(old, new, record.files):
+        log.warning(
+            "%s stays in %s, as it was made before: msgs-slam export --only makes it again", ", ".join(kept), old
+        )
 
 
 def unseal(run: RunFolder, name: str) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.atomic import write_text
-from ..geometry.sparse_model import SparseModel
+from ..geometry.sparse_model import FrameObservations, SparseModel
 from ..types import (
     VOID,
     Calibration,
@@ -219,6 +219,22 @@ TRAJECTORY: RunFile[Trajectory] = RunFile(
     },
 )  # fmt: skip
 """The poses as a stage left them."""
+
+
+def _frame_observations(arrays: Arrays) -> FrameObservations:
+    frame_id, point = (arrays[name].astype(np.int64) for name in ("frame_id", "obs_point"))
+    return FrameObservations(frame_id, point, arrays["obs_xy"])
+
+
+FRAME_OBSERVATIONS: RunFile[FrameObservations] = RunFile(
+    "frame_observations.npz", ("tracking",), "table of observations", _frame_observations,
+    lambda seen: {
+        "frame_id": seen.frame_id.astype(np.uint32), "obs_point": seen.obs_point.astype(np.uint32),
+        "obs_xy": seen.obs_xy.astype(np.float32),
+    },
+    {"frame_id": "i O", "obs_point": "i O", "obs_xy": "f O 2"},
+)  # fmt: skip
+"""Where frames that are no keyframes see the points of the stage's sparse model."""
 
 EVERY_FRAME: RunFile[Trajectory] = replace(TRAJECTORY, name="every_frame.npz", stages=("global_ba",))
 """The poses of all images of the source, which frame_ids count; none where all of them were picked."""

@@ -54,7 +54,7 @@ class World:
 
     @property
     def image_axes_from_exported(self) -> Array:
-        """(3, 3) rotation into x right, y down, z forward, as splats of unknown origin have them."""
+        """(3, 3) rotation into x right, y down, z forward: the axes of splat files, and of what they are trained on."""
         return _Y_DOWN_FROM_Z_UP if self.axes == "up" else np.eye(3)
 
 
@@ -107,6 +107,7 @@ def _pack(world: World) -> dict[str, Any]:
         "up_told_by": world.source,
         "floor_at_zero": world.has_floor,
         "unit": world.unit,
+        "splats_from_exported": world.image_axes_from_exported.tolist(),
         "degrees_from_up": world.disagreement_deg,
         **({} if world.earth is None else {"georeference": asdict(world.earth) | {"frame": "east north up"}}),
         "exported_from_run": {

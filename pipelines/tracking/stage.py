@@ -8,7 +8,17 @@ import numpy as np
 from ...formats.errors import InputError
 from ..engine.stages import StageContext
 from ..geometry.camera import Rig, rig_of
-from ..run.files import BACKBONE, CALIBRATION, DEPTH_FIELDS, FIGURES, FRAMES, GIVEN_POSES, SPARSE, TRAJECTORY
+from ..run.files import (
+    BACKBONE,
+    CALIBRATION,
+    DEPTH_FIELDS,
+    FIGURES,
+    FRAME_OBSERVATIONS,
+    FRAMES,
+    GIVEN_POSES,
+    SPARSE,
+    TRAJECTORY,
+)
 from ..sfm.adjust import FEATURE_SD
 from ..sfm.rolling import Shutter
 from ..system.memory import release_free_memory
@@ -21,7 +31,14 @@ from .front_end import FrontEnd, set_rotation_only_poses
 from .pictures import Pictures, load_shutter
 from .pnp import MAX_GAP
 from .segments import carry_given, join_segments, split_segments
-from .state import TrackState, split_worlds, sync_rig_poses, to_sparse_model, to_trajectory
+from .state import (
+    TrackState,
+    split_worlds,
+    sync_rig_poses,
+    to_frame_observations,
+    to_sparse_model,
+    to_trajectory,
+)
 
 SNAPSHOT_EVERY, SNAPSHOTS = 50, 20
 """Frames between two; of a long recording no more are taken in all, since each holds all that is known so far."""
@@ -58,6 +75,7 @@ def run(context: StageContext) -> dict[str, Any]:
     TRAJECTORY.save(context.folder, trajectory)
     model = to_sparse_model(state)
     SPARSE.save(context.folder, model)
+    FRAME_OBSERVATIONS.save(context.folder, to_frame_observations(state))
     DEPTH_FIELDS.save(context.folder, align_depths(model, report, intrinsics, pictures.proxy))
     figures = {**describe(state, frames, report, metric), **carried}
     figures["pieces"] = [len(p.poses) for p in pieces]

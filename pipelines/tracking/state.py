@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry import se3
 from ..geometry.camera import ONE_CAMERA, Rig
-from ..geometry.sparse_model import SparseModel
+from ..geometry.sparse_model import FrameObservations, SparseModel
 from ..sfm.rolling import Shutter, velocities
 from ..types import Array, Frame, Trajectory
 
@@ -253,3 +253,15 @@ def to_sparse_model(state: TrackState) -> SparseModel:
         renumbered.astype(np.int64),
         seen.xy,
     )
+
+
+def to_frame_observations(state: TrackState) -> FrameObservations:
+    """Return where the placed frames that are no keyframes see the points of `to_sparse_model`."""
+    used = np.unique(state.shared_sightings(state.keyframes)[1].point)
+    frames = sorted(set(state.poses).difference(state.keyframes, state.turned))
+    seen = [state.sightings[i] for i in frames]
+    frame_id = np.repeat(np.array(frames, np.int64), [len(s) for s in seen])
+    point = np.concatenate([np.zeros(0, np.int64), *(s.point for s in seen)])
+    xy = np.concatenate([np.zeros((0, 2)), *(s.xy for s in seen)])
+    kept = np.isin(point, used)
+    return FrameObservations(frame_id[kept], np.searchsorted(used, point[kept]), xy[kept].astype(np.float32))

@@ -16,8 +16,8 @@ from ...formats.textfile import number, read_json_object
 Array = NDArray[np.float64]
 
 FORMAT = "msgs-slam camera path 1"
-EXPORTED, RUN = "exported", "run"
-"""Worlds of a path: that of the exported files (or of the splat file), or that of a run without an export."""
+EXPORTED, RUN, SPLATS = "exported", "run", "splats"
+"""Worlds of a path: that of the exported files, that of a run without an export, and that of a splat file."""
 _LIMITS = {"fps": (0.1, 240.0), "seconds_per_keyframe": (0.05, 600.0), "fov_degrees": (1.0, 170.0)}
 _MAX_KEYFRAMES, _MAX_IMAGES = 1000, 100_000
 _AGAIN = "correct it, or record the path again in `msgs-slam view`"
@@ -33,7 +33,7 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Keyframes in `world`, one of EXPORTED and RUN, the same time apart; fps: images per second."""
+    """Keyframes in `world`, one of EXPORTED, RUN and SPLATS, the same time apart; fps: images per second."""
 
     keyframes: tuple[Keyframe, ...]
     fps: float = 30.0
@@ -85,8 +85,8 @@ def read_camera_path(path: Path, fps: float | None = None) -> CameraPath:
     if value.get("format") != FORMAT:
         found = str(value.get("format"))[:40]
         raise InputError(f"{path} is no camera path: its format is {found!r}, expected {FORMAT!r}. {_capital(_AGAIN)}")
-    if (world := value.get("world")) not in (EXPORTED, RUN):
-        raise InputError(f"{path}: world is {str(world)[:40]!r}, expected {EXPORTED!r} or {RUN!r}: {_AGAIN}")
+    if (world := value.get("world")) not in (worlds := (EXPORTED, RUN, SPLATS)):
+        raise InputError(f"{path}: world is {str(world)[:40]!r}, expected {' or '.join(map(repr, worlds))}: {_AGAIN}")
     rows = value.get("keyframes")
     if not isinstance(rows, list) or not 2 <= len(rows) <= _MAX_KEYFRAMES:
         count = len(rows) if isinstance(rows, list) else "no list of"

@@ -25,13 +25,14 @@ from ..evaluation.views import (
 )
 from ..outcome import Outcome, load_outcome
 from ..run.folder import RunFolder
+from ..run.target import Target
 from ..scene.world import WORLD, up_in_run
 from ..source.opening import is_of_source
 from ..system.progress import Progress, SilentProgress, log
 from ..system.wording import quoted
 from ..types import Intrinsics
-from .camera_path import EXPORTED, CameraPath, read_camera_path
-from .scene import up_of_file
+from .camera_path import RUN, SPLATS, CameraPath, read_camera_path
+from .scene import UP_OF_SPLATS
 
 Array = NDArray[np.float64]
 
@@ -47,6 +48,7 @@ PATHS = ("own", "smooth", "orbit")
 _SMOOTHING_SECONDS = 0.5
 _MAX_GAP, _MAX_OF_PHOTOS = 1.0, 60.0
 """Seconds of film between two neighbouring frames, and of a film along photos, which may be days apart."""
+_IMAGE_NAME = re.compile(r"\d{6,}\.png")
 _FILE_SUFFIX = re.compile(r"\.[a-z][a-z0-9]{1,4}")
 _FILE_SIZE, _FIELD_OF_VIEW = (960, 540), 50.0
 """Of images of a splat file, which stores no cameras: the field of view is from top to bottom, in degrees."""
@@ -61,21 +63,23 @@ def render_run(
     progress: Progress | None = None,
     size: tuple[int, int] | None = None,
     tell: Callable[[str], None] = log.info,
+    overwrite: bool = False,
 ) -> Path:
     """Draw the map along a path into a video (.mp4, .avi, .mkv) or, for a name without a suffix, a folder of PNG files.
 
     kind: one of `KINDS`; path: one of `PATHS`, or the file of a camera path, which takes as long as the walk took (of
     photos: a second each at most, a minute in all; an orbit: ten seconds; a file: as long as it says); fps: None = 30,
     or as the file says; size: (width, height) of an image, by default the run's; tell: is given the length of the film
-    before the first image is drawn. Returns `target`; where browsers will not play the video, a warning says so. Raises
-    InputError for an unknown kind or path, a bad file, or a run without a map.
+    before the first image is drawn; overwrite: whether other files than those of an earlier call may be replaced.
+    Returns `target`; where browsers will not play the video, a warning says so. Raises InputError for an unknown kind
+    or path, a bad file, a run without a map, or a target that holds files of others.
     """
     if kind not in KINDS:
         raise InputError(f"kind is one of {', '.join(KINDS)}; got {kind!r}")
     rate = 30.0 if fps is None else fps
-    _require_target(target, rate)
     if is_of_source(target, run):
         raise InputError(f"{target} is the source of {run.root}: name another file or folder")
+    place = _target(target, rate, overwrite)
     given = _given_path(path, fps)
     flown = None if given is None else _in_world_of_run(given, run)
     outcome = load_outcome(run)
@@ -90,7 +94,7 @@ def render_run(
     rate = rate if given is None else given.fps
     tell(_length(len(views), rate))
     steps = (progress or SilentProgress()).track(views, "rendering", len(views))
-    return _write(target, (_draw(seen, pose, kind, near, far) for seen, pose in steps), rate)
+    return _write(place, target, (_draw(seen, pose, kind, near, far) for seen, pose in steps), rate)
 
 
 def _length(count: int, fps: float) -> str:
@@ -105,6 +109,7 @@ def render_file(
     size: tuple[int, int] | None = None,
     path: str | Path = "orbit",
     tell: Callable[[str], None] = log.info,
+    overwrite: bool = False,
 ) -> Path:
     """Draw a splat file by any program along a circle round it, or the camera path in the file `path`, otherwise as
     `render_run`; by default 960x540.
@@ -112,21 +117,21 @@ def render_file(
     Raises InputError for a file that cannot be read or is empty, or a camera path in the world of a run.
     """
     rate = 30.0 if fps is None else fps
-    _require_target(target, rate)
-    given = _of_file(_given_path(path, fps), path)
+    place = _target(target, rate, overwrite)
+    given = _of_file(_given_path(path, fps), path, source)
     cloud = read_gaussians(source)
     if len(cloud) == 0:
         raise InputError(f"{source}: contains no Gaussians: nothing can be drawn. Export it again")
     scene, (width, height) = SplatScene.of(cloud), size or _FILE_SIZE
     if given is None:
-        poses = around(scene.middle, scene.size, up_of_file(source), round(10 * rate))
+        poses = around(scene.middle, scene.size, UP_OF_SPLATS, round(10 * rate))
         fovs = np.full(len(poses), _FIELD_OF_VIEW)
     else:
         (poses, fovs), rate = given.flight(), given.fps
     cameras = [_camera(width, height, fov) for fov in fovs]
     tell(_length(len(poses), rate))
     steps = (progress or SilentProgress()).track(range(len(poses)), "rendering", len(poses))
-    return _write(target, (draw_splats(scene, cameras[i], np.linalg.inv(poses[i])) for i in steps), rate)
+    return _write(place, target, (draw_splats(scene, cameras[i], np.linalg.inv(poses[i])) for i in steps), rate)
 
 
 def _camera(width: int, height: int, fov: float) -> Intrinsics:
@@ -134,13 +139,24 @@ def _camera(width: int, height: int, fov: float) -> Intrinsics:
     return Intrinsics(width, height, focal, focal, width / 2, height / 2)
 
 
-def _of_file(path: CameraPath | None, file: str | Path) -> CameraPath | None:
-    if path is not None and path.world != EXPORTED:
+def _of_file(path: CameraPath | None, file: str | Path, source: Path) -> CameraPath | None:
+    """The path in the world of the splat file `source`: one that was recorded in the run is turned where world.json
+    beside that says how."""
+    if path is not None and path.world == RUN:
         raise InputError(
             f"{file} was recorded in a run before its export, in other coordinates than a splat file has: give the run "
             "instead of the splat file, or record the path again"
         )
-    return path
+    if path is None or path.world == SPLATS or not (beside := source.with_name(WORLD.name)).is_file():
+        return path
+    return _turned(path, WORLD.read(beside).image_axes_from_exported)
+
+
+def _turned(path: CameraPath, rotation: Array) -> CameraPath:
+    motion = np.eye(4)
+    motion[:3, :3] = rotation
+    keyframes = tuple(replace(key, world_from_cam=motion @ key.world_from_cam) for key in path.keyframes)
+    return replace(path, keyframes=keyframes)
 
 
 def _given_path(path: str | Path, fps: float | None) -> CameraPath | None:
@@ -157,16 +173,18 @@ def _given_path(path: str | Path, fps: float | None) -> CameraPath | None:
 
 def _in_world_of_run(path: CameraPath, run: RunFolder) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The flight in the run's own world: (N, 4, 4) world_from_cam, (N,) fields of view in degrees."""
+    if path.world == RUN:
+        return path.flight()
+    if (world := run.find(WORLD)) is None:
+        raise InputError(
+            f"the camera path is in the coordinates of exported files, and {run.root} has none: "
+            f"run `msgs-slam resume {quoted(run.root)}` first"
+        )
+    if path.world == SPLATS:
+        path = _turned(path, world.image_axes_from_exported.T)
     poses, fovs = path.flight()
-    if path.world == EXPORTED:
-        if (world := run.find(WORLD)) is None:
-            raise InputError(
-                f"the camera path is in the coordinates of exported files, and {run.root} has none: "
-                f"run `msgs-slam resume {quoted(run.root)}` first"
-            )
-        cam_from_run = world.exported_from_run.inverse().apply_to_poses(np.linalg.inv(poses))
-        return np.asarray(np.linalg.inv(cam_from_run), np.float64), fovs
-    return poses, fovs
+    cam_from_run = world.exported_from_run.inverse().apply_to_poses(np.linalg.inv(poses))
+    return np.asarray(np.linalg.inv(cam_from_run), np.float64), fovs
 
 
 def _seeing(outcome: Outcome, fov: float) -> Outcome:
@@ -177,28 +195,39 @@ def _seeing(outcome: Outcome, fov: float) -> Outcome:
     return replace(outcome, calibration=replace(outcome.calibration, intrinsics=zoomed))
 
 
-def _require_target(target: Path, fps: float) -> None:
+def _target(target: Path, fps: float, overwrite: bool) -> Target:
+    """The folder that a film or its images are written into. Raises InputError for another suffix than a film's, a rate
+    out of range, and where files of others are in the way."""
     if not 0.1 <= fps <= 240:
         raise InputError(f"--fps is 0.1 to 240 frames a second; got {fps}")
     suffix = target.suffix.lower()
-    if suffix in CODECS or target.is_dir():
-        return
-    if target.is_file() or _FILE_SUFFIX.fullmatch(suffix):
+    if suffix not in CODECS and not target.is_dir() and (target.is_file() or _FILE_SUFFIX.fullmatch(suffix)):
         what = "is a file" if target.is_file() else f"cannot be written as {suffix}"
         raise InputError(f"{target} {what}: name a video that ends in {', '.join(CODECS)}, or a folder for PNG images")
+    place = Target(target.parent if suffix in CODECS else target, overwrite)
+    place.require(_belongs(target))
+    return place
 
 
-def _write(target: Path, pictures: Iterator[Picture], fps: float) -> Path:
-    kind = target.suffix.lower()
-    if kind not in CODECS:
-        return _write_pictures(target, pictures)
-    if kind != ".mp4":
-        return write_video(target, pictures, fps)
-    if (codec := write_browser_video(target, pictures, fps)) not in PLAYED:
-        log.warning(
-            "%s is %s, which browsers do not play: nothing here writes H.264 or VP9. %s",
-            target, codec, install_extra("hdr"),
-        )  # fmt: skip
+def _belongs(target: Path) -> Callable[[str], bool]:
+    """Which names of a folder are those of the film, or of its images."""
+    if target.suffix.lower() in CODECS:
+        return target.name.__eq__
+    return lambda name: _IMAGE_NAME.fullmatch(name) is not None
+
+
+def _write(place: Target, target: Path, pictures: Iterator[Picture], fps: float) -> Path:
+    with place.replacing(_belongs(target)) as staged:
+        if (kind := target.suffix.lower()) not in CODECS:
+            for number, picture in enumerate(pictures):
+                write_rgb(staged / f"{number:06d}.png", picture)
+        elif kind != ".mp4":
+            write_video(staged / target.name, pictures, fps)
+        elif (codec := write_browser_video(staged / target.name, pictures, fps)) not in PLAYED:
+            log.warning(
+                "%s is %s, which browsers do not play: nothing here writes H.264 or VP9. %s",
+                target, codec, install_extra("hdr"),
+            )  # fmt: skip
     return target
 
 
@@ -212,21 +241,6 @@ def _of_size(outcome: Outcome, size: tuple[int, int]) -> Outcome:
     return replace(
         outcome, calibration=replace(outcome.calibration, intrinsics=Intrinsics(width, height, fx, fy, cx, cy))
     )
-
-
-def _write_pictures(folder: Path, pictures: Iterator[Picture]) -> Path:
-    count = 0
-    for picture in pictures:
-        write_rgb(folder / f"{count:06d}.png", picture)
-        count += 1
-    others = [p for p in folder.glob("*.png") if p.stem.isdecimal() and int(p.stem) >= count]
-    if others:
-        log.warning(
-            "%s holds %d numbered images from before besides the %d of this rendering, %s the first: remove them, or "
-            "name a new folder",
-            folder, len(others), count, min(p.name for p in others),
-        )  # fmt: skip
-    return folder
 
 
 def _path(outcome: Outcome, path: str, fps: float, scene_depth: float) -> NDArray[np.float64]:

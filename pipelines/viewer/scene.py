@@ -27,13 +27,15 @@ from ..run.folder import RunFolder, load_records
 from ..scene.upright import cameras_up
 from ..scene.world import WORLD, up_in_run
 from ..types import ClassTable, Frame, Intrinsics, Metres
-from .camera_path import EXPORTED, RUN
+from .camera_path import EXPORTED, RUN, SPLATS
 
 Array = NDArray[np.float64]
 
 MODES = ("colour", "classes", "depth")
 MAX_CAMERAS = 60
 GAUSSIANS, POINTS = "Gaussians", "points"
+UP_OF_SPLATS = np.array([0.0, -1, 0])
+"""Splat files have x right, y down, z forward."""
 _POINT_RADIUS = 0.012
 """Of a scene as shown."""
 _USUAL_SIZE = 5.0
@@ -228,18 +230,12 @@ def _from_file(path: Path) -> ViewerScene:
         title=path.name,
         cloud=cloud,
         scale=_scale(cloud.means, np.zeros((0, 3))),
-        up=up_of_file(path),
+        up=UP_OF_SPLATS,
+        world=SPLATS,
         labels=cloud.class_ids,
         class_names=table.names,
         class_colors=table.colors,
     )
-
-
-def up_of_file(path: Path) -> NDArray[np.float64]:
-    """z in a PLY of this program's export, as world.json beside it says; else y points down, as in most splat files."""
-    world = path.with_name(WORLD.name)
-    stands = path.suffix == ".ply" and world.is_file() and WORLD.read(world).axes == "up"
-    return np.array([0.0, 0, 1] if stands else [0.0, -1, 0])
 
 
 def _scale(means: NDArray, centers: NDArray) -> float:

@@ -15,6 +15,7 @@ from msgs_slam.pipelines.run import files
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
 from msgs_slam.pipelines.run.manifest import Source, read_manifest, write_manifest
 from msgs_slam.pipelines.run.schema import RunFile
+from msgs_slam.pipelines.run.target import LIST
 
 ALL_OF_THEM = """
 import json, sys
@@ -50,7 +51,7 @@ def test_nothing_is_written_elsewhere(
     assert done.returncode == 0, done.stderr
     assert files_below(*(tmp_path / name for name in ("home", "temporary", "here"))) == {}
     assert files_below(finished_run.truth, finished_run.video.parent) == source
-    assert {p.name for p in asked.iterdir()} == {"export", "walk.mp4", "report.html"}
+    assert {p.name for p in asked.iterdir()} == {"export", "walk.mp4", "report.html", LIST}
     assert {p.name for p in tmp_path.iterdir()} == {"run.msgs", "asked", "home", "temporary", "here"}
     assert {p.name for p in run.iterdir() if p.name not in {q.name for q in finished_run.folder.iterdir()}} == {
         "evaluation"
@@ -73,13 +74,19 @@ def test_what_the_user_has_is_not_overwritten(
     for words in (("render", run, photos), ("export", run, "--only", "nerfstudio", "--to", photos.parent)):
         refused = invoke(*words)
         assert (refused.exit_code, "is the source of" in refused.stderr) == (1, True)
-    refused = invoke("export", run, "--only", "html", "--to", site)
-    assert (refused.exit_code, "holds README.txt already" in refused.stderr) == (1, True)
+    for kind, name in (("html", "README.txt"), ("tiles", "README.txt, tiles")):
+        refused = invoke("export", run, "--only", kind, "--to", site)
+        assert (refused.exit_code, f"holds {name}, which msgs-slam has not written" in refused.stderr) == (1, True)
+    (site / "film.mp4").write_text("mine")
+    for words in (("render", run, site / "film.mp4"), ("report", run, "--to", site / "film.mp4")):
+        refused = invoke(*words)
+        assert (refused.exit_code, "add --overwrite" in refused.stderr) == (1, True)
+    (site / "film.mp4").unlink()
     assert files_below(tmp_path / "scene", site, finished_run.video.parent) == before
 
     (site / "README.txt").unlink()
-    for kind in ("html", "tiles", "tiles"):
-        assert invoke("export", run, "--only", kind, "--to", site).exit_code == 0
+    assert invoke("export", run, "--only", "html", "--to", site).exit_code == 0
+    assert invoke("export", run, "--only", "tiles", "--to", site, "--overwrite").exit_code == 0
     assert (site / "tiles" / "tile.png").read_text() == "mine"
     assert (site / "tiles" / "tileset.json").is_file()
 

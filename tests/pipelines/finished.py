@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.run.ending import checksums
+from msgs_slam.pipelines.run.ending import results
 from msgs_slam.pipelines.run.folder import RunFolder, save_settings
 from msgs_slam.pipelines.run.manifest import Manifest, Source, StageRecord, content_digest, settings_of, write_manifest
 
@@ -15,7 +15,7 @@ def note_finished(
     config = config or Config()
     records = {}
     for name in stages:
-        files = checksums(run.stage(name))
+        files = results(run.stage(name))
         settings = settings_of(config, name)
         records[name] = StageRecord("", files, seconds, 50 * seconds, {}, [], content_digest(files), None, settings)
     write_manifest(run.manifest_file, Manifest(Source(source, ""), records))

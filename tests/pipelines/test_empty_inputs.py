@@ -159,7 +159,7 @@ def few_poses() -> Iterator[Any]:
         yield lambda p=poses: (smoothed(p, 2.0), resampled(p, 0))
         yield lambda n=count: align_keyframes(model(n), camera(12, 16), lambda _: None, {})
         yield lambda n=count: align_keyframes(model(n, n), camera(12, 16), lambda _: maps((12, 16), 2, 1), {})
-        yield lambda n=count: seen_points(model(n, n), np.arange(n))
+        yield lambda n=count: seen_points(model(n, n), np.arange(n), camera(12, 16), EYE[None].repeat(n, 0))
     yield lambda: (orbit(EYE[None], 2.0, 5, UP), cameras_up(EYE[None]))
     yield lambda: up_of_lines([], np.empty((0, 4, 4)), camera(2, 2), UP)
     yield lambda: (associate(NONE, np.ones(2)), associate(np.full(2, np.nan), np.ones(2)))

@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 
 from ....formats.atomic import write_text
 from ....formats.errors import InputError
-from ....formats.mesh import read_mesh_ply
 from ...outcome import Outcome
-from ...run.files import MESH
 from ...run.folder import RunFolder
-from ...scene.world import WORLD
+from ...scene.world import FIRST, WORLD, World
+from .meshes import mesh_of_run
 from .walls import Wall, find_walls
 
 Array = NDArray[np.float64]
@@ -28,37 +27,34 @@ _STYLE = (
 
 
 def walls_of_run(run: RunFolder) -> list[Wall]:
-    """Walls in the world of the run's exported files.
+    """Find the walls, in the world of the run's exported files.
 
     Raises InputError where the run has no mesh, its files do not stand upright, or no wall is found.
     """
-    if not run.has("export", MESH):
-        raise InputError(
-            f"{run.root} has no mesh yet, and a floor plan is drawn from it: finish the run with msgs-slam resume"
-        )
-    world = run.find(WORLD)
-    if world is None or world.axes != "up":
+    return _walls(run, run.find(WORLD) or FIRST)
+
+
+def _walls(run: RunFolder, world: World) -> list[Wall]:
+    mesh = mesh_of_run(run, world)
+    if world.axes != "up":
         raise InputError(
             f"{run.root}: a floor plan needs to know which way is up, and the exported files do not say so: film some "
             "floor and some upright edges, or if export.axes is first, set it to up"
         )
-    mesh = read_mesh_ply(run.file("export", MESH))
     if not (walls := find_walls(mesh.vertices, mesh.faces)):
         raise InputError(f"{run.root}: no wall is seen well enough for a floor plan: film walls from floor to ceiling")
     return walls
 
 
-def write_floor_plan(outcome: Outcome, folder: Path) -> list[Path]:
-    """floorplan.svg, of an outcome in the run's own world. Raises what `walls_of_run` raises."""
-    walls, world = walls_of_run(outcome.run), outcome.run.find(WORLD)
-    assert world is not None
-    moved = outcome.moved(world.exported_from_run).trajectory
+def write_floor_plan(outcome: Outcome, world: World, folder: Path) -> list[Path]:
+    """Write floorplan.svg for files in `world`, in which `outcome` stands. Raises InputError as `walls_of_run`."""
+    walls, trajectory = _walls(outcome.run, world), outcome.trajectory
     per_unit, spread, about = 1.0, 0.0, ""
-    if world.earth is None and not outcome.metric and (metres := outcome.metres) is not None:
+    if not outcome.metric and (metres := outcome.metres) is not None:
         per_unit, spread, about = metres.per_unit, metres.relative_sd, metres.text
-    unit = "m" if about or outcome.metric or world.earth is not None else "units"
-    text = floor_plan(walls, moved.centers[moved.is_placed], outcome.run.place.stem, per_unit, unit, about, spread)
-    write_text(folder / FLOOR_PLAN, text)
+    unit = "m" if about or outcome.metric else "units"
+    path = trajectory.centers[trajectory.is_placed]
+    write_text(folder / FLOOR_PLAN, floor_plan(walls, path, outcome.run.place.stem, per_unit, unit, about, spread))
     return [folder / FLOOR_PLAN]
 
 

@@ -12,25 +12,27 @@ from scipy.spatial import ConvexHull, QhullError
 from ....formats.atomic import atomic_path, require_room
 from ....formats.errors import InputError, install_extra
 from ....formats.glb import Part, linear, material, write_primitive
-from ....formats.mesh import MeshArrays, read_mesh_ply
+from ....formats.images import write_rgb
+from ....formats.mesh import MeshArrays, TexturedMesh, read_mesh_ply, read_textured_glb
 from ...outcome import Outcome
 from ...run.files import MESH
+from ...run.folder import RunFolder
 from ...scene.world import WORLD, World
 from .atlas import simplified
 
-USD = "mesh.usdz"
+USD, GLB = "mesh.usdz", "mesh.glb"
+_TEXTURE = "texture.jpg"
 
 COLLISION = "collision.glb"
 MAX_FACES = 20_000
 """Triangles that physics engines on the web and on phones take."""
 
 
-def mesh_of_run(outcome: Outcome, world: World) -> MeshArrays:
-    """The mesh that a run's own export has made, in `world`; `outcome` is in the run's own.
+def mesh_of_run(run: RunFolder, world: World) -> MeshArrays:
+    """Read the mesh that a run's own export has made, and move it into `world`.
 
     Raises InputError where there is none, or an empty one.
     """
-    run = outcome.run
     if not run.has("export", MESH):
         raise InputError(
             f"{run.root} has no mesh yet, and this file is made from it: finish the run with msgs-slam resume"
@@ -45,11 +47,11 @@ def mesh_of_run(outcome: Outcome, world: World) -> MeshArrays:
 
 
 def write_collision(outcome: Outcome, world: World, folder: Path) -> list[Path]:
-    """collision.glb of an outcome in the run's own world, for files in `world`: no colours, y up.
+    """Write collision.glb for files in `world`: no colours, y up.
 
     Raises InputError where the run has no mesh, or an empty one.
     """
-    mesh = mesh_of_run(outcome, world)
+    mesh = mesh_of_run(outcome.run, world)
     light = simplified(mesh, MAX_FACES / len(mesh.faces)) if len(mesh.faces) > MAX_FACES else mesh
     points = light.vertices.astype(np.float64)
     faces = light.faces
@@ -75,7 +77,8 @@ def with_floor(points: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[N
 
 
 def write_usd(outcome: Outcome, world: World, folder: Path) -> list[Path]:
-    """mesh.usdz of an outcome in the run's own world, for files in `world`: y up, a colour and a class at each vertex.
+    """Write mesh.usdz for files in `world`, in which `outcome` stands: y up, the texture of mesh.glb or else a colour
+    at each vertex, and the class of each vertex.
 
     Raises InputError where usd-core is not installed, or the run has no mesh, or an empty one.
     """
@@ -83,17 +86,31 @@ def write_usd(outcome: Outcome, world: World, folder: Path) -> list[Path]:
         import pxr  # noqa: F401
     except ImportError as error:
         raise InputError(f"USD needs the package usd-core, which is not installed: {install_extra('usd')}") from error
-    mesh = mesh_of_run(outcome, world)
-    per_unit = 1.0 if outcome.metric or world.earth or outcome.metres is None else outcome.metres.per_unit
+    mesh = _textured_of_run(outcome.run, world) or mesh_of_run(outcome.run, world)
+    per_unit = 1.0 if outcome.metric or outcome.metres is None else outcome.metres.per_unit
     write_usdz(folder / USD, mesh, outcome.classes.names, world.gltf_from_exported, per_unit)
     return [folder / USD]
 
 
+def _textured_of_run(run: RunFolder, world: World) -> TexturedMesh | None:
+    """The mesh with the texture that a run's own export has made, in `world`; None where it has no texture."""
+    own = run.find(WORLD)
+    if own is None or not run.has("export", GLB) or (mesh := read_textured_glb(run.file("export", GLB))) is None:
+        return None
+    move = world.exported_from_run @ own.exported_from_run.inverse()
+    vertices = move.apply(mesh.vertices.astype(np.float64) @ own.gltf_from_exported)
+    return replace(mesh, vertices=vertices.astype(np.float32))
+
+
 def write_usdz(
-    path: Path, mesh: MeshArrays, names: tuple[str, ...], turn: NDArray[np.float64], metres_per_unit: float
+    path: Path,
+    mesh: MeshArrays | TexturedMesh,
+    names: tuple[str, ...],
+    turn: NDArray[np.float64],
+    metres_per_unit: float,
 ) -> None:
-    """Write a package with one binary layer in it; `turn` (3, 3) makes y up. Raises DiskFullError where there
-    is no room for it."""
+    """Write a package with one binary layer in it, and the texture where the mesh has one; `turn` (3, 3) makes y up.
+    Raises DiskFullError where there is no room for it."""
     from pxr import Usd, UsdGeom, UsdUtils
 
     require_room(path, 2 * 24 * len(mesh.vertices))  # a layer, and the package with a copy of it
@@ -104,43 +121,85 @@ def write_usdz(
         root = UsdGeom.Xform.Define(stage, "/Scene")
         stage.SetDefaultPrim(root.GetPrim())
         shape = UsdGeom.Mesh.Define(stage, "/Scene/Mesh")
-        _fill(shape, mesh, names, (mesh.vertices @ turn.T).astype(np.float32))
-        _paint(stage, shape)
+        if isinstance(mesh, TexturedMesh):
+            write_rgb(Path(scratch) / _TEXTURE, mesh.texture)
+            corner = mesh.corner_vertex
+            _fill(shape, mesh.vertices[corner] @ turn.T, mesh.faces, mesh.labels[corner], names)
+            _paint(stage, shape, _add_texture(stage, shape, mesh.corner_uv))
+        else:
+            _fill(shape, mesh.vertices @ turn.T, mesh.faces, mesh.labels, names)
+            _paint(stage, shape, _add_colors(stage, shape, mesh.colors))
         stage.Save()
         package = Path(scratch) / USD
         UsdUtils.CreateNewUsdzPackage(str(layer), str(package))
         package.replace(temporary)
 
 
-def _fill(shape: Any, mesh: MeshArrays, names: tuple[str, ...], points: NDArray[np.float32]) -> None:
-    """Triangles, linear colours, and the number of each vertex's class as the primvar `label`."""
+def _fill(
+    shape: Any,
+    points: NDArray[np.floating],
+    faces: NDArray[np.int32],
+    labels: NDArray[np.uint8],
+    names: tuple[str, ...],
+) -> None:
+    """Triangles, and the number of each vertex's class as the primvar `label`."""
     from pxr import Sdf, UsdGeom, Vt
 
-    colors = linear(mesh.colors / 255)
+    points = points.astype(np.float32)
     shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
-    shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
-    shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.astype(np.int32).ravel()))
+    shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+    shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
     shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     shape.CreateDoubleSidedAttr(True)
     shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
-    shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(colors))
-    labels = UsdGeom.PrimvarsAPI(shape).CreatePrimvar("label", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.vertex)
-    labels.Set(Vt.IntArray.FromNumpy(mesh.labels.astype(np.int32)))
+    primvar = UsdGeom.PrimvarsAPI(shape).CreatePrimvar("label", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.vertex)
+    primvar.Set(Vt.IntArray.FromNumpy(labels.astype(np.int32)))
     shape.GetPrim().SetCustomDataByKey("classes", Vt.StringArray(list(names)))
 
 
-def _paint(stage: Any, shape: Any) -> None:
-    """A material that shows the colours: some viewers ignore them without one."""
+def _add_colors(stage: Any, shape: Any, colors: NDArray[np.uint8]) -> Any:
+    """The output of a shader with the colour of each vertex: some viewers ignore these without a material."""
+    from pxr import Sdf, UsdGeom, Vt
+
+    shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(linear(colors / 255)))
+    reader = _shader(stage, "Reader", "UsdPrimvarReader_float3")
+    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
+    return reader.CreateOutput("result", Sdf.ValueTypeNames.Float3)
+
+
+def _add_texture(stage: Any, shape: Any, uv: NDArray[np.float32]) -> Any:
+    """The output of a shader with the texture, whose v counts from below in USD."""
+    from pxr import Sdf, UsdGeom, Vt
+
+    types = Sdf.ValueTypeNames
+    st = UsdGeom.PrimvarsAPI(shape).CreatePrimvar("st", types.TexCoord2fArray, UsdGeom.Tokens.vertex)
+    st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(uv * [1, -1] + [0, 1], np.float32)))
+    reader = _shader(stage, "Reader", "UsdPrimvarReader_float2")
+    reader.CreateInput("varname", types.String).Set("st")
+    texture = _shader(stage, "Texture", "UsdUVTexture")
+    texture.CreateInput("file", types.Asset).Set(f"./{_TEXTURE}")
+    texture.CreateInput("sourceColorSpace", types.Token).Set("sRGB")
+    texture.CreateInput("wrapS", types.Token).Set("clamp")
+    texture.CreateInput("wrapT", types.Token).Set("clamp")
+    texture.CreateInput("st", types.Float2).ConnectToSource(reader.CreateOutput("result", types.Float2))
+    return texture.CreateOutput("rgb", types.Float3)
+
+
+def _shader(stage: Any, name: str, kind: str) -> Any:
+    from pxr import UsdShade
+
+    shader = UsdShade.Shader.Define(stage, f"/Scene/Colours/{name}")
+    shader.CreateIdAttr(kind)
+    return shader
+
+
+def _paint(stage: Any, shape: Any, color: Any) -> None:
+    """A material with the colour that a shader puts out."""
     from pxr import Sdf, UsdShade
 
     material = UsdShade.Material.Define(stage, "/Scene/Colours")
-    surface = UsdShade.Shader.Define(stage, "/Scene/Colours/Surface")
-    surface.CreateIdAttr("UsdPreviewSurface")
+    surface = _shader(stage, "Surface", "UsdPreviewSurface")
     surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
-    reader = UsdShade.Shader.Define(stage, "/Scene/Colours/Reader")
-    reader.CreateIdAttr("UsdPrimvarReader_float3")
-    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
-    color = reader.CreateOutput("result", Sdf.ValueTypeNames.Float3)
     surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(color)
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
     UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)

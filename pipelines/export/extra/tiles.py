@@ -4,7 +4,6 @@ A binary tree: the Gaussians are halved along the longest side until a tile is s
 its two halves with fewer, larger Gaussians (`merged`). The file format is that of `write_compressed_glb`.
 """
 
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +39,7 @@ _WIDEST = 0.5
 def write_tiles(outcome: Outcome, world: World, folder: Path) -> list[Path]:
     """tiles/tileset.json and its tiles; nothing where there are no Gaussians. `outcome` stands in `world`.
 
-    tileset.json is written last, and the tiles are removed where one of the files cannot be written. Raises
-    DiskFullError before anything is made where there is no room for it.
+    tileset.json is written last. Raises DiskFullError before anything is made where there is no room for it.
     """
     m = outcome.require_map()
     if len(m) == 0:
@@ -49,31 +47,18 @@ def write_tiles(outcome: Outcome, world: World, folder: Path) -> list[Path]:
     require_room(folder / TILES, _MIN_BYTES * len(m))
     means, log_radii, logits, colors = (x.cpu().numpy() for x in (m.means, m.log_radii, m.opacity_logits, m.colors))
     cloud = isotropic_cloud((means @ world.image_axes_from_exported.T).astype(np.float32), log_radii, logits, colors)
-    _clear(target := folder / TILES)
-    try:
-        root, _ = _write_tile(cloud, target, "tile")
-        root["refine"], root["transform"] = "REPLACE", _earth_from_tiles(outcome, world).ravel(order="F").tolist()
-        splats = [EXTENSION, COMPRESSION]
-        document = {
-            "asset": {"version": "1.1", "extras": {"generator": "msgs-slam"}},
-            "extensionsUsed": ["3DTILES_content_gltf"],  # by which CesiumJS knows Gaussians before it loads any
-            "extensions": {"3DTILES_content_gltf": {"extensionsUsed": splats, "extensionsRequired": splats}},
-            "geometricError": float(2 * np.max(root["boundingVolume"]["box"][3:])),
-            "root": root,
-        }
-        write_json(target / TILESET, document)
-    except BaseException:
-        _clear(target)
-        raise
+    root, _ = _write_tile(cloud, target := folder / TILES, "tile")
+    root["refine"], root["transform"] = "REPLACE", _earth_from_tiles(outcome, world).ravel(order="F").tolist()
+    splats = [EXTENSION, COMPRESSION]
+    document = {
+        "asset": {"version": "1.1", "extras": {"generator": "msgs-slam"}},
+        "extensionsUsed": ["3DTILES_content_gltf"],  # by which CesiumJS knows Gaussians before it loads any
+        "extensions": {"3DTILES_content_gltf": {"extensionsUsed": splats, "extensionsRequired": splats}},
+        "geometricError": float(2 * np.max(root["boundingVolume"]["box"][3:])),
+        "root": root,
+    }
+    write_json(target / TILESET, document)
     return [target]
-
-
-def _clear(folder: Path) -> None:
-    """Remove the tiles of an earlier export; what else lies there is somebody's."""
-    for old in [folder / TILESET, *folder.glob("tile*.glb")]:
-        old.unlink(missing_ok=True)
-    with suppress(OSError):
-        folder.rmdir()
 
 
 def _write_tile(cloud: GaussianCloud, folder: Path, name: str) -> tuple[dict[str, Any], GaussianCloud]:

@@ -12,7 +12,7 @@ from finished import note_finished
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.image_folder import list_images
-from msgs_slam.formats.images import read_rgb
+from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.formats.video import VideoReader
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.demo import TRUTH, VIDEO, demo_summary, run_demo, unpack_demo_clip
@@ -37,16 +37,19 @@ def test_own_path_in_colour_shows_the_frames(oracle_run: OracleRun, truth: Seque
     assert psnr(pictures[0], truth.rgb(0)) > psnr(pictures[0], truth.rgb(20)) + 4
 
 
-def test_pictures_of_an_earlier_rendering_are_reported_and_stay(
-    oracle_run: OracleRun, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    run, folder = oracle_run(), tmp_path / "pictures"
-    for fps in (1.6, 1.6):
-        assert len(list_images(render_run(run, folder, path="own", fps=fps))) == 5
-    assert "from before" not in caplog.text
-    render_run(run, folder, path="own", fps=1.0)
-    assert f"{folder} holds 2 numbered images from before besides the 3 of this rendering, 000003.png" in caplog.text
-    assert len(list_images(folder)) == 5
+def test_a_rendering_replaces_an_earlier_one_and_no_photographs(oracle_run: OracleRun, tmp_path: Path) -> None:
+    run, folder, photos = oracle_run(), tmp_path / "pictures", tmp_path / "photos"
+    for fps, count in ((1.6, 5), (1.6, 5), (1.0, 3)):
+        assert len(list_images(render_run(run, folder, path="own", fps=fps, size=(32, 24)))) == count
+    write_rgb(photos / "000001.png", np.zeros((4, 4, 3), np.uint8))
+    (tmp_path / "film.mp4").write_bytes(b"precious")
+    for target in (photos, tmp_path / "film.mp4"):
+        with pytest.raises(InputError, match=r"which msgs-slam has not written.*--overwrite"):
+            render_run(run, target, path="own", fps=1.0, size=(32, 24))
+    assert [p.name for p in list_images(photos)] == ["000001.png"]
+    assert (tmp_path / "film.mp4").read_bytes() == b"precious"
+    render_run(run, photos, path="own", fps=1.0, size=(32, 24), overwrite=True)
+    assert len(list_images(photos)) == 3
 
 
 def test_a_video_whose_name_has_no_suffix_is_no_folder(oracle_run: OracleRun, tmp_path: Path) -> None:

@@ -23,8 +23,8 @@ from msgs_slam.formats.mesh import TexturedMesh, write_textured_glb
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.evaluation.facts import Capture, advice, found_lengths, lost_stretches
 from msgs_slam.pipelines.evaluation.html import BROWSERS, Line, page, plot, print_pdf, section, table, ticks
-from msgs_slam.pipelines.evaluation.report import write_report
-from msgs_slam.pipelines.evaluation.write import PATH_FROM_ABOVE, write_evaluation
+from msgs_slam.pipelines.evaluation.report import truth_section, write_report
+from msgs_slam.pipelines.evaluation.write import JUDGED, PATH_FROM_ABOVE, write_evaluation
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import load_outcome
@@ -111,6 +111,20 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     assert re.findall(r'(?:src|href)="(?!data:)', html) == []
     assert re.findall(r"https?://(?!www\.w3\.org/2000/svg)", html) == []
     assert len(html) < 3_000_000
+
+
+def test_an_evaluation_of_an_earlier_map_is_not_shown_as_of_this_one(oracle_run: OracleRun, truth: Sequence) -> None:
+    run = oracle_run()
+    evaluation, outcome = write_evaluation(run, truth, max_views=1), load_outcome(run)
+    assert "ATE Sim(3)" in truth_section(evaluation, outcome)
+    for stage, what in (("tracking", "poses"), ("mapping", "map")):
+        if stage in (outcome.pose_stage, outcome.map_stage):
+            records = {**outcome.records, stage: replace(outcome.records[stage], content="of other settings")}
+            text = truth_section(evaluation, replace(outcome, records=records))
+            assert "ATE" not in text
+            assert f"made for earlier {'poses and map' if outcome.pose_stage == stage == 'mapping' else what}" in text
+    del evaluation[JUDGED]
+    assert "ATE" not in truth_section(evaluation, outcome), "by an earlier version: of which map, nothing says"
 
 
 def test_the_report_shows_the_mesh_and_links_the_page_beside_it(oracle_run: OracleRun, tmp_path: Path) -> None:

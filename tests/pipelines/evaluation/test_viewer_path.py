@@ -21,11 +21,12 @@ from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import WORLD, World
-from msgs_slam.pipelines.viewer.camera_path import EXPORTED, RUN, CameraPath, Keyframe, read_camera_path
+from msgs_slam.pipelines.viewer.camera_path import EXPORTED, RUN, SPLATS, CameraPath, Keyframe, read_camera_path
 from msgs_slam.pipelines.viewer.render_run import render_file, render_run
 from tests.browser import BROWSER, browser
 
 OracleRun = Callable[..., RunFolder]
+Y_DOWN = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 def key(center: tuple[float, float, float], degrees: float = 0.0, fov: float = 50.0) -> Keyframe:
@@ -122,6 +123,10 @@ def test_a_run_is_drawn_from_the_keyframes_of_either_world(
     same = [read_rgb(p) for p in list_images(render_run(run, tmp_path / "same", path=exported, fps=0.5))]
     assert len(same) == 2
     assert np.abs(same[1].astype(float) - own[2]).mean() < 0.5
+    turned = tuple(Keyframe(Y_DOWN @ p, fov) for p in moved)  # recorded in the splat file of this run
+    splats = written(tmp_path, CameraPath(turned, 1.0, 2.0, SPLATS))
+    same = [read_rgb(p) for p in list_images(render_run(run, tmp_path / "splats", path=splats, fps=0.5))]
+    assert np.abs(same[1].astype(float) - own[2]).mean() < 0.5
     wide = written(tmp_path, CameraPath(tuple(Keyframe(k.world_from_cam, 1.6 * fov) for k in keys), 1.0, 2.0, RUN))
     assert psnr(read_rgb(list_images(render_run(run, tmp_path / "wide", path=wide))[0]), own[0]) < 20
 
@@ -136,6 +141,12 @@ def test_a_splat_file_is_drawn_along_a_path_and_a_wrong_one_refused_first(tmp_pa
         read_rgb(p) for p in list_images(render_file(tmp_path / "s.ply", tmp_path / "o", path=away, size=(64, 48)))
     ]
     assert [image.mean() > 5 for image in images] == [True, False]  # the wall ahead, then nothing
+    WORLD.save(tmp_path, World("up", "floor", True, Similarity(1.0, np.eye(3), np.zeros(3))))
+    for world, turn in ((SPLATS, np.eye(4)), (EXPORTED, Y_DOWN.T)):
+        keys = tuple(Keyframe(turn @ k.world_from_cam, k.fov) for k in (key((0, 0, 0)), key((0, 0, 0), 120)))
+        path = written(tmp_path, CameraPath(keys, 1.0, 1.0, world))
+        files = list_images(render_file(tmp_path / "s.ply", tmp_path / "o", path=path, size=(64, 48)))
+        assert all(np.array_equal(read_rgb(file), image) for file, image in zip(files, images, strict=True))
     with pytest.raises(InputError, match="give the run instead"):
         render_file(tmp_path / "s.ply", tmp_path / "x", path=written(tmp_path, CameraPath(SQUARE, world=RUN)))
     with pytest.raises(InputError, match="there is no file 'orbot'"):

@@ -10,24 +10,32 @@ import plyfile
 import pycolmap
 import pytest
 import trimesh
+from click.testing import CliRunner
 from evo.tools import file_interface
+from finished import note_finished
 
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.splats import read_gaussian_glb
 from msgs_slam.formats.spz import read_spz
+from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.config import EXPORTS, ExportConfig
+from msgs_slam.pipelines.export import stage
 from msgs_slam.pipelines.export.extra import texture as textured
 from msgs_slam.pipelines.export.readme import licences
-from msgs_slam.pipelines.export.stage import export_run
+from msgs_slam.pipelines.export.stage import export_run, find_world
 from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.run.files import FRAMES, LEFT_OUT, PROXY_MAPS
+from msgs_slam.pipelines.run.files import FRAMES, LEFT_OUT, METRES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.lock import RunBusyError, locked
+from msgs_slam.pipelines.run.target import LIST
 from msgs_slam.pipelines.scene.world import WORLD
 from msgs_slam.pipelines.types import Metres
 
 OracleRun = Callable[..., RunFolder]
+Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 SETTINGS = ExportConfig(spz=True, splat_glb=True, voxel=0.03)
 
 
@@ -56,10 +64,11 @@ def exported(run: RunFolder, folder: Path) -> Outcome:
 
 def test_poses_are_the_same_everywhere(run: RunFolder, folder: Path, exported: Outcome) -> None:
     t = exported.trajectory
+    turned = t.moved(Similarity(1.0, Y_DOWN, np.zeros(3)).apply_to_poses)
     model = pycolmap.Reconstruction(folder / "sparse" / "0")
     names = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
     assert len(names) == len(t.frame_ids)
-    for frame, pose in zip(run.load(FRAMES), t.cam_from_world, strict=True):
+    for frame, pose in zip(run.load(FRAMES), turned.cam_from_world, strict=True):
         np.testing.assert_allclose(names[frame.name], pose[:3], atol=1e-9)
         given, kept = folder / "images" / frame.name, run.stage("frames") / frame.name
         assert given.read_bytes() == kept.read_bytes()
@@ -68,7 +77,7 @@ def test_poses_are_the_same_everywhere(run: RunFolder, folder: Path, exported: O
     np.testing.assert_allclose(tum.timestamps, t.timestamps, atol=1e-6)
     np.testing.assert_allclose(tum.positions_xyz, t.centers, atol=1e-6)
     nerfstudio = open_sequence(folder / "transforms.json")
-    np.testing.assert_allclose(nerfstudio.world_from_cam, t.world_from_cam, atol=1e-6)
+    np.testing.assert_allclose(nerfstudio.world_from_cam, turned.world_from_cam, atol=1e-6)
 
 
 def test_all_files_have_the_same_rights(folder: Path) -> None:
@@ -82,7 +91,7 @@ def test_map_is_the_same_everywhere(folder: Path, exported: Outcome) -> None:
     vertex = plyfile.PlyData.read(str(folder / "point_cloud.ply"))["vertex"]
     np.testing.assert_allclose(vertex["scale_0"], m.log_radii, atol=1e-6)
     np.testing.assert_allclose(vertex["opacity"], m.opacity_logits, atol=1e-6)
-    np.testing.assert_allclose(vertex["z"], m.means[:, 2], atol=1e-6)
+    np.testing.assert_allclose(vertex["y"], -m.means[:, 2], atol=1e-6)
     small = read_spz(folder / "point_cloud.spz")
     # The reader gives x right, y down, z forward.
     np.testing.assert_allclose(small.means[:, [0, 2]], m.means[:, :2], atol=1e-3)
@@ -128,7 +137,7 @@ def test_obj_alone_and_colours_without_a_texture(run: RunFolder, tmp_path: Path)
     few = replace(SETTINGS, texture=False, mesh_side=160)
     names = [path.name for path in export_run(run, tmp_path / "obj", "obj", settings=few)]
     assert names == [*(f"mesh.{kind}" for kind in ("obj", "mtl", "png")), "world.json", "README.txt"]
-    assert sorted(p.name for p in (tmp_path / "obj").iterdir()) == sorted(names)
+    assert sorted(p.name for p in (tmp_path / "obj").iterdir()) == sorted([LIST, *names])
     export_run(run, tmp_path / "mesh", "mesh", settings=few)
     glb, ply = (trimesh.load(tmp_path / "mesh" / n, force="mesh", process=False) for n in ("mesh.glb", "mesh.ply"))
     np.testing.assert_allclose(glb.vertices[:, [0, 2, 1]] * (1, -1, 1), ply.vertices, atol=1e-5)
@@ -155,11 +164,13 @@ def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
 
 def test_a_mask_of_an_earlier_export_does_not_stay(run: RunFolder, tmp_path: Path) -> None:
     """Trainers read masks/ beside images/: one that the run has no longer would leave out what is there."""
-    export_run(run, tmp_path, "colmap")
     frame = run.load(FRAMES)[0]
-    LEFT_OUT.save(tmp_path, np.ones((4, 4), bool), frame.name)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RunFolder, "left_out", lambda self, frame: np.ones((4, 4), bool))
+        export_run(run, tmp_path, "colmap")
+    assert LEFT_OUT.path(tmp_path, frame.name).exists()
     export_run(run, tmp_path, "colmap")
-    assert not LEFT_OUT.path(tmp_path, frame.name).exists()
+    assert not (tmp_path / "masks").exists()
 
 
 def test_licences_of_the_networks_are_in_the_notes() -> None:
@@ -189,6 +200,59 @@ def test_a_track_that_says_too_little_is_warned_of(
     export_run(run, tmp_path / "out", "tum", settings=ExportConfig(gps=str(tmp_path / "track.csv")))
     assert "not georeferenced: only 2 of its fixes are of the time of the recording" in caplog.text
     assert WORLD.read(tmp_path / "out" / "world.json").earth is None
+
+
+def test_a_home_folder_in_a_setting_is_found(run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "t.csv").write_text("time,lat,lon\n0,50,10\n1,50.001,10\n")
+    words = ["export", str(run.root), "--only", "tum", "--to", str(tmp_path / "out"), "--set", "export.gps=~/t.csv"]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 0, result.output
+    assert "only 2 of its fixes" in result.output
+
+
+def test_free_scale_holds_in_every_file(oracle_run: OracleRun, tmp_path: Path) -> None:
+    """A guess of the metres is in no file of an export that leaves the unit open."""
+    run = oracle_run(metric=False, mesh=True)
+    world, _ = find_world(load_outcome(run), ExportConfig())
+    WORLD.save(run.stage("export"), world)
+    METRES.save(run.stage("export"), Metres(3.7, 0.25, True, ("1 door",)))
+    note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
+    seen = []
+
+    def see(*arguments: object) -> list[Path]:
+        outcome = next(value for value in arguments if isinstance(value, Outcome))
+        seen.append((outcome.metres, outcome.move is not None))
+        return []
+
+    with pytest.MonkeyPatch.context() as patch:
+        writers = [n for n in vars(stage) if n.startswith("write_") and n not in ("write_pieces", "write_readme")]
+        for name in set(writers) - {"write_all_but_mesh", "write_meshes", "write_notes", "write_world"}:
+            patch.setattr(stage, name, see)
+        for kind in set(EXPORTS) - {"mesh", "obj"}:
+            patch.setattr(stage, "write_world", lambda outcome, world, folder: WORLD.save(folder, world))
+            export_run(run, tmp_path / kind, kind, settings=ExportConfig(scale="free"))
+    assert seen == [(None, True)] * (len(EXPORTS) - 2)
+
+
+def test_what_others_keep_in_the_run_s_export_is_kept(oracle_run: OracleRun) -> None:
+    """Files of the user, and of exports on request, beside those of the stage, of which none changes."""
+    run = oracle_run(video=True)
+    own = run.stage("export")
+    export_run(run, own, "tum")
+    note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
+    (own / "notes.txt").write_text("mine")
+    (own / "trajectory.txt").write_text("edited")
+    with pytest.raises(InputError, match=r"holds trajectory\.txt, .*--overwrite"):
+        export_run(run, own, "tum")
+    export_run(run, own, "tum", overwrite=True)
+    assert run.damaged("export") == []
+    with pytest.raises(InputError, match="--redo export"):
+        export_run(run, own, "tum", settings=ExportConfig(axes="first"), overwrite=True)
+    assert run.damaged("export") == []
+    with locked(run), pytest.raises(RunBusyError):
+        export_run(RunFolder(run.root), own, "tum")
+    assert (own / "notes.txt").read_text() == "mine"
 
 
 def test_a_run_without_a_map_is_refused(oracle_run: OracleRun, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from msgs_slam.formats import atomic
 from msgs_slam.formats.errors import DiskFullError
 from msgs_slam.formats.gaussians import GaussianCloud
 from msgs_slam.formats.splats import read_gaussian_glb
+from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.extra import tiles
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.outcome import load_outcome
@@ -128,14 +129,16 @@ def test_a_full_disk_leaves_nothing_half_written(
     written: tuple[RunFolder, Path, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, folder, _ = written
+    before = {p: p.read_bytes() for p in folder.parent.rglob("*") if p.is_file()}
 
     def fill(path: Path) -> None:
         if path.name == "tile01.glb":
             raise OSError(28, "No space left on device", str(path))
 
     with atomic.after_each_write(fill), pytest.raises(DiskFullError):
-        export_run(run, folder.parent, "tiles")
-    assert not folder.exists()
+        export_run(run, folder.parent, "tiles", settings=ExportConfig(axes="first"), overwrite=True)
+    after = {p: p.read_bytes() for p in folder.parent.rglob("*") if p.is_file()}
+    assert after == before, "neither half of the files nor the loss of the earlier ones"
 
 
 def test_a_disk_without_room_is_told_before_anything_is_made(

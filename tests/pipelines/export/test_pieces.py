@@ -87,7 +87,9 @@ def test_damage_inside_a_piece_is_named_and_mended_to_the_same_bytes(whole: RunF
     path = copy.root / "piece_2" / "mapping" / "map.safetensors"
     data = path.read_bytes()
     path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
-    (copy.root / "piece_3").mkdir()  # of an earlier state of the run
+    shutil.copytree(copy.root / "piece_2", copy.root / "piece_3")  # of an earlier state of the run
+    (copy.root / "piece_4").mkdir()
+    (copy.root / "piece_4" / "notes.txt").write_text("mine")
     assert "piece_2/mapping/map.safetensors" in invoke("status", copy.root)
     refused = CliRunner().invoke(main, ["resume", str(copy.root / "piece_2")])
     assert refused.exit_code == 1
@@ -96,3 +98,4 @@ def test_damage_inside_a_piece_is_named_and_mended_to_the_same_bytes(whole: RunF
     assert (digests(copy.root / "piece_2" / "mapping"), digests(copy.stage("export"))) == before
     assert copy.damaged("export") == []
     assert not (copy.root / "piece_3").exists()
+    assert (copy.root / "piece_4" / "notes.txt").read_text() == "mine"

@@ -17,7 +17,16 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, DEPTH_FIELDS, FRAMES, GIVEN_POSES, SPARSE, TRAJECTORY
+from msgs_slam.pipelines.run.files import (
+    BACKBONE,
+    CALIBRATION,
+    DEPTH_FIELDS,
+    FRAME_OBSERVATIONS,
+    FRAMES,
+    GIVEN_POSES,
+    SPARSE,
+    TRAJECTORY,
+)
 from msgs_slam.pipelines.sfm.retrieval import describe
 from msgs_slam.pipelines.tracking import adjust, pictures, segments, stage
 from msgs_slam.pipelines.tracking.stage import run as run_tracking
@@ -124,6 +133,15 @@ def test_sparse_model_reprojects_and_scales_are_right(
     xy = (in_cam @ camera.matrix.T)[:, :2] / in_cam[:, 2:]
     errors = np.linalg.norm(xy - model.obs_xy, axis=1)
     assert 0.1 < np.median(errors) < 1.0
+    # The frames between keyframes see the same points, with the poses of the trajectory.
+    seen, trajectory = made.run.load(FRAME_OBSERVATIONS), made.run.load(TRAJECTORY, "tracking")
+    assert set(seen.frame_id) == set(trajectory.frame_ids[~trajectory.is_keyframe])
+    row = {int(i): n for n, i in enumerate(trajectory.frame_ids)}
+    poses, points = trajectory.cam_from_world, model.points_in_world
+    agreeing = [len(seen.agreeing(points, row, camera, poses, within)[0]) for within in (0.1, 1.0, 4.0)]
+    assert agreeing[0] < len(seen.obs_xy) / 2 < agreeing[1]
+    assert agreeing[2] > 0.95 * len(seen.obs_xy)
+    assert np.unique(seen.frame_id, return_counts=True)[1].min() > 20
     # Depths a quarter too large make a world a quarter too large, and then they are right.
     assert 0 < scale_error(made, 1.0) < 0.02
     assert trajectory_error(made, scale=True) < 0.01
