@@ -19,7 +19,7 @@ from .atomic import write_bytes, write_lines, write_text
 from .colmap_files import model_suffix, names_in_text, require_whole_files
 from .errors import InputError
 from .ply import slices
-from .reading import opened, parsing
+from .reading import opened, parsing, require_file
 from .trajectory import FARTHEST, nearest_rotation, poses_from_quaternions
 
 if TYPE_CHECKING:
@@ -141,6 +141,9 @@ def _load(folder: Path) -> Any:
             pass
     if suffix == ".bin":
         require_whole_files(folder)
+    for part in ("rigs", "frames"):  # of newer models, where pycolmap finds poses first
+        if (file := folder / f"{part}{suffix}").is_file():
+            require_file(file)
     reconstruction = pycolmap.Reconstruction()
     with parsing(f"the COLMAP model in {folder}", "such model"):
         (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(str(folder))

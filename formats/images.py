@@ -1,7 +1,6 @@
 """Image files to arrays and back: colour, depth, labels, and what the camera wrote beside the image."""
 
 import io
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from .atomic import write_bytes
 from .colours import UnusableProfile, has_other_colours, in_srgb
 from .errors import InputError
 from .exif import ANTICLOCKWISE, QUARTER_TURNS, TURNS, ExifLens, lens_of, place_of
+from .quiet import ignored_warnings
 from .reading import opened, parsing, read_bytes
 
 MAX_IMAGE_PIXELS = 120_000_000
@@ -336,8 +336,7 @@ def _quiet_open(file: IO[bytes], name: str) -> Image.Image:
     from pi_heif import register_heif_opener  # takes as long to import as all the rest of a command that opens none
 
     register_heif_opener()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit follows
+    with ignored_warnings(category=Image.DecompressionBombWarning):  # our own limit follows
         try:
             return Image.open(file, formats=_FORMATS)
         except Image.DecompressionBombError:

@@ -3,25 +3,48 @@
 import errno
 import hashlib
 import os
+import re
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+import time
+import unicodedata
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from io import BufferedReader
 from pathlib import Path
 
 from .errors import InputError
 from .names import folded, path_parts
 
-_LONGEST_NAME, _LONGEST_PATH = 255, 4000
+LONGEST_NAME, _LONGEST_PATH = 255, 4000
 """Bytes that Linux takes for a part of a path, and a little less than it takes for the whole."""
+
+_PATH_IN_NAME = re.compile(r"[/\\]|^[A-Za-z]:")
+_NOT_IN_NAMES = frozenset({"Cc", "Cs", "Zl", "Zp"})
+"""Unicode's control characters, halves of pairs (so Python shows bytes that are no UTF-8), and line breaks."""
 
 _LFS_POINTER = b"version https://git-lfs"
 _MAX_REASON_CHARACTERS = 200
+_JUST_WRITTEN = 2.0
+"""Seconds."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 Listed = dict[Path, dict[str, list[str]]]
 """What is in folders, by its `folded` names."""
+_noted: ContextVar[list[Path] | None] = ContextVar("_noted", default=None)
+
+
+@contextmanager
+def noting_files() -> Iterator[list[Path]]:
+    """Yield a list that gets the path of each file that this thread opens, by `opened` and what is built on it, in the
+    block: what an identity of the result has to cover."""
+    files: list[Path] = []
+    token = _noted.set(files)
+    try:
+        yield files
+    finally:
+        _noted.reset(token)
 
 
 @contextmanager
@@ -83,6 +106,8 @@ def opened(path: Path, limit: int | None = None, *, any_content: bool = False) -
             raise InputError(f"{str(path)!r} is no path: check the spelling") from error
         except IsADirectoryError:
             raise InputError(f"{path} is a folder, not a file") from None
+    if (noted := _noted.get()) is not None:
+        noted.append(path)
     with file:
         with reaching(path):
             _require_kind(path, file, limit)
@@ -156,17 +181,61 @@ def resolve_within(root: Path, relative: str, named_by: Path) -> Path:
     """Return `root / relative`, where `named_by` is the file that says so.
 
     Raises InputError when the name leads out of `root`, by `..` or as an absolute path: data from others must not
-    reach into the rest of the disk. Links are followed: whoever may make one in the folder has the disk already.
+    reach into the rest of the disk. Links are followed, for people put data sets together from links, and what is found
+    is only read; `resolve_own` is for folders that are written to.
     """
     name = os.path.normpath(relative)  # so that no `..` is left that would be looked up behind a link
     try:
         long = len(os.fsencode(root / name)) > _LONGEST_PATH
-        long = long or any(len(os.fsencode(part)) > _LONGEST_NAME for part in name.split("/"))
+        long = long or any(len(os.fsencode(part)) > LONGEST_NAME for part in name.split("/"))
     except ValueError:
         long = True  # half a character, which no path can hold
     if long or "\0" in relative or os.path.isabs(name) or name.split("/")[0] == "..":
         raise InputError(f"{named_by} names the file {relative[:300]!r}, outside {root}: correct the entry")
     return root / name
+
+
+def is_plain_name(name: str) -> bool:
+    """Return whether a text names one entry of a folder, on every system: no path, no drive, no control character or
+    line break, valid UTF-8 of at most 255 bytes."""
+    return (
+        name not in ("", ".", "..")
+        and _PATH_IN_NAME.search(name) is None
+        and not any(unicodedata.category(character) in _NOT_IN_NAMES for character in name)
+        and len(name.encode("utf-8")) <= LONGEST_NAME
+    )
+
+
+def is_plain_path(relative: str) -> bool:
+    """Return whether a text is a path of plain names (`is_plain_name`) with slashes between them."""
+    return all(map(is_plain_name, relative.split("/")))
+
+
+def resolve_own(root: Path, relative: str) -> Path:
+    """Return `root / relative` in a folder that only this program fills, as a run, whoever it is from.
+
+    Raises InputError for what is no plain path (`is_plain_path`), and where a part of it is a link: an unpacked archive
+    may hold any, and what is written or removed behind it would be elsewhere on the disk.
+    """
+    if not is_plain_path(relative):
+        raise InputError(f"{root} names the file {relative[:300]!r}, which may lie outside: use a copy that is whole")
+    path = root
+    for part in relative.split("/"):
+        path = path / part
+        require_no_link(path)
+    return path
+
+
+def require_no_link(path: Path) -> None:
+    """Raise InputError for a link, whatever it leads to."""
+    if path.is_symlink():
+        raise InputError(f"{path} is a link, which may lead anywhere: put what it leads to in its place, or remove it")
+
+
+def links_in(folder: Path) -> Iterator[Path]:
+    """Yield the links below a folder, following none."""
+    for path, folders, files in os.walk(folder):
+        yield from (link for name in (*folders, *files) if (link := Path(path, name)).is_symlink())
 
 
 def named_file(
@@ -213,9 +282,41 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def files_sha256(named: Iterable[tuple[str, Path]], head: bytes = b"") -> str:
-    """Hex SHA-256 over `head` and the names and contents of files, wherever they are. Raises as `file_sha256`."""
+_known_digests: dict[Path, tuple[tuple[int, ...], str]] = {}
+
+
+def known_sha256(path: Path) -> str:
+    """Return `file_sha256`, taken once in this process for as long as the file's inode, size and times stay: videos are
+    gigabytes. One that has just been written is read each time, for it may be written again at the same time of the
+    clock."""
+    with reaching(path):
+        stamp = _stamp(path)
+    known = _known_digests.get(path)
+    if known is None or known[0] != stamp:
+        began, digest = time.time(), file_sha256(path)
+        if began - max(stamp[2:]) / 1e9 < _JUST_WRITTEN or _stamp(path) != stamp:
+            return digest
+        known = _known_digests[path] = (stamp, digest)
+    return known[1]
+
+
+def _stamp(path: Path) -> tuple[int, ...]:
+    status = path.stat()
+    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def files_sha256(
+    named: Iterable[tuple[str, Path]], head: bytes = b"", of_file: Callable[[Path], str] = file_sha256
+) -> str:
+    """Hex SHA-256 over `head` and the names and contents of files, wherever they are, each digested by `of_file`.
+    Raises as `file_sha256`."""
     digest = hashlib.sha256(head)
     for name, path in named:
-        digest.update(f"{name}\0{file_sha256(path)}\n".encode("utf-8", "surrogateescape"))
+        digest.update(f"{name}\0{of_file(path)}\n".encode("utf-8", "surrogateescape"))
     return digest.hexdigest()
+
+
+def user_cache() -> Path | None:
+    """Return the folder for what programs of this user can make again; None for a user without a home folder."""
+    place = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return None if place.startswith("~") else Path(place)

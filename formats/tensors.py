@@ -30,8 +30,10 @@ HEADERS = Lock()
 """Held while numpy reads the header of an array: it parses it as Python, and CPython 3.11 raises SystemError where
 two threads of different depth parse at once (python/cpython#106905)."""
 MAX_UNPACKED_BYTES = 1024**3
-"""A foreign packed file whose arrays would take more memory in total is refused: a few kilobytes can unpack to
-anything."""
+"""A packed file whose arrays would take more memory in total is refused: a few kilobytes can unpack to anything."""
+MOST_PACKED = 50
+"""Of a run's own file each byte may unpack to so many on top: deflate could make a thousand of it, arrays of this
+program pack to a tenth at best where they are large."""
 
 
 def save_arrays(path: Path, arrays: Mapping[str, NDArray], *, compress: bool = True) -> None:
@@ -53,16 +55,17 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray], *, compress: bool = T
 
 
 def load_arrays(path: Path, *, own: bool = False) -> dict[str, NDArray]:
-    """Return the arrays of an .npz file; `own`: one of a run, which a checksum says that this program has written.
+    """Return the arrays of an .npz file; `own`: one of a run.
 
-    Raises InputError when it is missing, damaged, or holds objects; a foreign one too when it unpacks to more than
-    `MAX_UNPACKED_BYTES`: what was written of a long recording has to be read again, however large.
+    Raises InputError when it is missing, damaged, holds objects, or unpacks to more than `MAX_UNPACKED_BYTES`; one of a
+    run may be larger where the file is (`MOST_PACKED`): what was written of a long recording has to be read again. A
+    run's checksums are no reason to trust it further, for whoever made the run made them too.
     """
-    require_file(path)
+    limit = MAX_UNPACKED_BYTES + own * MOST_PACKED * require_file(path)
     with parsing(path, ".npz file of plain arrays", "make it again"), zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
         total = sum(entry.file_size for entry in entries)
-        if total > MAX_UNPACKED_BYTES and not own:
+        if total > limit:
             raise InputError(f"{path} would unpack to {total / 1e9:.0f} GB: it is not a file of this program")
         arrays = {}
         for entry in entries:

@@ -20,6 +20,8 @@ from .errors import InputError
 from .reading import parsing, read_bytes
 
 MAX_JSON_BYTES = 32 * 1024 * 1024
+MAX_OWN_JSON_BYTES = 256 * 1024 * 1024
+"""Of a file of a run: a manifest of 400,000 keyframes. Taken apart it needs ten times its size."""
 MAX_TOML_BYTES = 1024 * 1024
 MAX_XML_BYTES = 16 * 1024 * 1024
 _DEEPEST_XML = 64
@@ -162,8 +164,7 @@ def read_json(path: Path, limit: int | None = MAX_JSON_BYTES, *, allow_nan: bool
 
     With `allow_nan` NaN and Infinity pass, which many programs write into poses they have lost.
 
-    Raises InputError when it is missing, larger than `limit` bytes (None, for what a run holds: of any size), damaged,
-    or nested too deep.
+    Raises InputError when it is missing, larger than `limit` bytes (None: of any size), damaged, or nested too deep.
     """
     text = read_text(path, limit)
     with parsing(path, "valid JSON", "was it cut short or edited by hand?"):

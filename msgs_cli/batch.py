@@ -75,8 +75,8 @@ def batch(
     config = chosen_config(config_file, overrides, given)
     out.mkdir(parents=True, exist_ok=True)
     placement, cpus, threads = _open_placement(engine_name, address, config.run.threads)
-    options = ["--until", until, "--threads", str(threads), *output.options, *option_words(given)]
-    options += [f"--set={text}" for text in overrides]
+    options = ["--until", until, "--threads", str(threads), *output.options]
+    options += option_words(given, overrides, config)
     options += [] if config_file is None else ["--config", str(config_file.resolve())]
     try:
         with output.stopping_softly("The same command goes on with it."):

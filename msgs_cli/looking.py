@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from .options import OVERWRITE, RUN_ARGUMENT, open_run
+from .options import OVERWRITE, RUN_ARGUMENT, open_run, use_threads
 from .output import Output, on_sigterm, say, verbosity_options
 
 
@@ -63,10 +63,12 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | No
     sequence = open_sequence(truth, truth_format)
     from ..pipelines.evaluation.write import evaluation_table, write_evaluation
 
+    use_threads(run)
+    folder = run.evaluation_file.parent
     with on_sigterm(signal.SIG_DFL):
         figures = write_evaluation(run, sequence, output.progress(), class_map=joins)
     say(evaluation_table(figures, with_protocol=False))
-    output.report_result(evaluation=run.evaluation_file.parent)
+    output.report_result(evaluation=folder)
 
 
 @click.command()
@@ -87,6 +89,7 @@ def report(run_path: Path, to: Path | None, pdf: bool, overwrite: bool, output: 
     from ..pipelines.evaluation.html import find_browser
     from ..pipelines.evaluation.report import write_report
 
+    use_threads(run)
     browser = find_browser() if pdf else ""
     with on_sigterm(signal.SIG_DFL):
         page = write_report(run, to, output.progress(), browser, overwrite)
@@ -149,6 +152,7 @@ def render(
     run = None if is_file else open_run(source)
     from ..pipelines.viewer.render_run import render_file, render_run
 
+    use_threads(run)
     with on_sigterm(signal.SIG_DFL):
         if run is None:
             made = render_file(source, target, fps, output.progress(), size, camera_path, output.report, overwrite)
@@ -169,10 +173,10 @@ def view(path: Path, port: int, host: str) -> None:
 
     Needs the extra [viewer]: pip install '.[viewer]' in the checkout.
     """
-    if path.is_dir():
-        open_run(path)
+    run = open_run(path) if path.is_dir() else None
     from ..pipelines.viewer.server import open_viewer
 
+    use_threads(run)
     try:
         with on_sigterm(signal.default_int_handler):
             viewer = open_viewer(path, host, port)

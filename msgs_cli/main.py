@@ -34,6 +34,7 @@ from .options import (
     quality_option,
     settings_options,
     source_options,
+    use_threads,
 )
 from .output import (
     Output,
@@ -299,6 +300,7 @@ def export(
     run = open_run(run_path)
     from ..pipelines.export.stage import export_run
 
+    use_threads(run)
     settings = with_absolute_paths(load_config(config_file, overrides, base=made_with(run))).export
     kind, folder = _COMES_WITH.get(only or "", only), to or run.stage("export")
     with on_sigterm(signal.SIG_DFL):

@@ -137,10 +137,37 @@ def chosen_config(
     return config
 
 
-def option_words(given: Mapping[str, str | int | None]) -> list[str]:
-    """The options of settings that were given, for the command line of another process."""
+def option_words(given: Mapping[str, str | int | None], overrides: Iterable[str], config: Config) -> list[str]:
+    """The options of settings that were given, for the command line of another process, which may work in another
+    folder: the files and folders that they name are made absolute.
+
+    Args:
+        given: of the options of settings, by `section__key`; None where one is not given.
+        overrides: of --set.
+        config: the settings that all of the command line, --config included, amounts to.
+    """
+    from ..pipelines.config import config_to_dict
+    from ..pipelines.read_config import with_absolute_paths
+
+    typed, absolute = config_to_dict(config), config_to_dict(with_absolute_paths(config))
+    paths = {f"{s}.{k}": v for s, keys in absolute.items() for k, v in keys.items() if v != typed[s][k]}
     options = {key.replace(".", "__"): f.metadata["option"].name for key, f in settings_with_options().items()}
-    return [f"--{options[key]}={value}" for key, value in given.items() if value is not None]
+    words = [f"--set={text}" for text in overrides] + [f"--set={key}={value}" for key, value in paths.items()]
+    return words + [
+        f"--{options[key]}={value}"
+        for key, value in given.items()
+        if value is not None and key.replace("__", ".", 1) not in paths
+    ]
+
+
+def use_threads(run: RunFolder | None = None) -> None:
+    """Let the libraries of this process use as many CPU threads as the run's settings say, or all that there are: a
+    container's share, not its machine's."""
+    from ..pipelines.engine.tasks import set_threads
+    from ..pipelines.run.folder import load_settings
+    from ..pipelines.system.memory import available_cpus
+
+    set_threads((load_settings(run).run.threads if run is not None else 0) or available_cpus())
 
 
 def open_run(path: Path) -> RunFolder:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..formats.errors import install_command, install_extra
 from .system.device import unused_card
-from .system.memory import available_cpus
+from .system.memory import available_cpus, machine_memory
 from .system.wording import BAD, GOOD, NOTE, Finding
 
 DISTRIBUTION = "msgs-slam"
@@ -127,9 +127,7 @@ def _threads() -> Finding:
 
 
 def _memory() -> Finding:
-    if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
-        return Finding("memory", NOTE, "cannot be asked on this system")
-    size = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9
+    size = machine_memory() / 1e9
     if size < _MIN_MEMORY:
         fix = "--set frames.max_side=480 needs less, or take a machine with more"
         return Finding("memory", NOTE, f"{size:.1f} GB; under {_MIN_MEMORY:g} long videos may not fit", fix)

@@ -34,10 +34,9 @@ from .run.files import (
     SUBMAPS,
     TRAJECTORY,
 )
-from .run.folder import RunFolder, load_records, load_settings, load_source
-from .run.manifest import StageRecord, keyframe_psnr, recorded_config
+from .run.folder import RunFolder, load_records, load_settings, load_source, why_not_done
+from .run.manifest import StageRecord, keyframe_psnr, piece_digest, recorded_config
 from .system.device import resolve_device
-from .system.wording import quoted
 from .types import VOID, Calibration, ClassTable, Frame, Metres, Trajectory
 
 T = TypeVar("T")
@@ -119,9 +118,7 @@ class Outcome:
     def require_map(self) -> GaussianMap:
         """The map. Raises InputError before mapping is done."""
         if self.gaussian_map is None:
-            raise InputError(
-                f"{self.run.root}: there is no map yet. Run `msgs-slam resume {quoted(self.run.root)}` first"
-            )
+            raise InputError(f"{self.run.root}: there is no map yet ({why_not_done(self.run, 'mapping')})")
         return self.gaussian_map
 
     def load_sparse(self) -> SparseModel | None:
@@ -152,8 +149,14 @@ class Outcome:
 
     def pieces(self) -> list[Outcome]:
         """Load the disconnected components, each in a world of its own, largest first, as far as they are done."""
-        pieces = [RunFolder(self.run.root / name) for name in self.run.pieces("tracking")]
-        return [load_outcome(p) for p in pieces if p.manifest_file.exists() and "tracking" in load_records(p)]
+        pieces = {name: self.run.piece(name) for name in self.run.pieces("tracking")}
+        return [
+            load_outcome(piece)
+            for name, piece in pieces.items()
+            if piece.manifest_file.exists()
+            and "tracking" in load_records(piece)
+            and load_source(piece).digest == piece_digest(self.records, name)  # not one of an earlier result
+        ]
 
     def frame_row(self, frame_id: int) -> int:
         """Row of a frame in the trajectory."""
@@ -166,9 +169,7 @@ def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
     config = recorded_config(records, load_settings(run))
     pose_stage = next((s for s in _POSE_STAGES if s in records), "")
     if not pose_stage:
-        raise InputError(
-            f"{run.root}: no camera poses yet (tracking is not done). Run `msgs-slam resume {quoted(run.root)}` first"
-        )
+        raise InputError(f"{run.root}: no camera poses yet ({why_not_done(run, 'tracking')})")
     trajectory = run.load(TRAJECTORY, pose_stage)
     map_stage = next((s for s in _MAP_STAGES if s in records), "")
     report = run.load(FIGURES["proxy"])

@@ -72,7 +72,7 @@ def one_source(sources: Sequence[Path], run: RunFolder) -> Path:
     require_different(sources)
     require_listable([*sources, run.root])
     _require_run_or_empty(run)
-    path, text = run.root / SOURCE_LIST, "".join(f"{source.resolve()}\n" for source in sources)
+    path, text = run.path(SOURCE_LIST), "".join(f"{source.resolve()}\n" for source in sources)
     same = path.is_file() and path.read_bytes() == text.encode()
     if run.manifest_file.exists() and not same:
         raise InputError(
@@ -126,7 +126,7 @@ def reconstruct(
     _require_run_or_empty(run)
     require_device(config.run.device)  # refused before anything is written
     with locked(run):
-        _require_same_source(run, source, digest)
+        _require_same_source(run, source, digest, config.run.format)
         return _run(run, source.resolve(), digest, config, progress, until, workers, threads)
 
 
@@ -149,7 +149,6 @@ def resume(
     config: Config | None = None,
     until: str = STAGES[-1],
     workers: TaskWorkers | None = None,
-    on_locked: Callable[[], None] = lambda: None,
     redo: str = "",
 ) -> dict[str, StageRecord]:
     """Go on with a run from its own settings, or from `config`; the stage `redo` and those after it are made again."""
@@ -163,7 +162,6 @@ def resume(
     config = _settled(config or load_settings(run), run)
     require_device(config.run.device)
     with locked(run):
-        on_locked()
         return _run(run, source, origin.digest, config, progress, until, workers, redo=redo)
 
 
@@ -193,16 +191,12 @@ def work_on_run(
             disk); other processes go on.
     """
 
-    def retire_left_boards() -> None:
-        for board in boards_in(run):
-            board.retire()
-
     workers = SharedWorkers(shard, prepare, config.run.threads or available_cpus())
     log.info("shard %d of %d", shard.index, shard.count)
     while True:
         with suppress(RunBusyError):
             if not never_lead:
-                return resume(run, prepare("run"), config, until, workers, retire_left_boards)
+                return resume(run, prepare("run"), config, until, workers)
         if not any(board.do_one(shard, prepare) for board in boards_in(run)):
             stop_if_asked()
             time.sleep(BETWEEN_LOOKS)
@@ -265,13 +259,17 @@ def _run(
         try:
             same = source_digest(source, config.run.format) == digest
         except InputError as error:
+            _require_format(run, source, digest, config.run.format)
             raise RecoverableError(f"{error}. {kept}") from error
         if not same:
+            _require_format(run, source, digest, config.run.format)
             raise RecoverableError(
                 f"{source} has changed since {run.root} was made. {kept}. Or reconstruct what it is now into another "
                 "folder: --out NEW"
             )
 
+    for board in boards_in(run):  # of a leader that was killed: its tasks are of a stage that may have ended
+        board.retire()
     threads = config.run.threads or (workers.threads if workers else threads) or available_cpus()
     with ProgressFile(progress, run) as noted:
         stages = all_stages(config.run.method)
@@ -285,16 +283,32 @@ def _require_run_or_empty(run: RunFolder) -> None:
     # All that there is when the first file is being written.
     begun = {LOCK, LEADER, SOURCE_LIST, temporary_of(run.manifest_file).name}
     # Other processes have names of their own for the list, and for a look at a leader.
-    others = (temporary_of(run.root / SOURCE_LIST).stem, f"{LEADER}-")
+    others = (temporary_of(run.path(SOURCE_LIST)).stem, f"{LEADER}-")
     if any(p.name not in begun and not p.name.startswith(others) for p in run.root.iterdir()):
         raise InputError(f"{run.root} exists and is not a run folder. Choose another with --out FOLDER")
 
 
-def _require_same_source(run: RunFolder, source: Path, digest: str) -> None:
+def _require_format(run: RunFolder, source: Path, digest: str, format: str) -> None:
+    """Raise RecoverableError where the source is as it was and only read by another `run.format`."""
+    was = made_with(run).run.format
+    try:
+        is_other = was != format and source_digest(source, was) == digest
+    except InputError:  # which the caller reports
+        return
+    if not is_other:
+        return
+    raise RecoverableError(
+        f"run.format={format} reads other images, times or cameras from {source} than {was}, with which {run.root} was "
+        f"made: go on with --set run.format={was}, or make another run with --out NEW"
+    )
+
+
+def _require_same_source(run: RunFolder, source: Path, digest: str, format: str) -> None:
     if not run.manifest_file.exists():
         return
     origin = load_source(run)
     if origin.digest != digest:
+        _require_format(run, source, origin.digest, format)
         raise InputError(
             f"{run.root} is the run of another source ({origin.path}), not of {source}. "
             "Choose another folder with --out FOLDER, or delete it"

@@ -16,7 +16,7 @@ from .networks.card import Card
 from .networks.registry import ModelStore, metric_card
 from .proxy.selection import choose_depth, choose_semantics
 from .run.files import CALIBRATION
-from .run.folder import RunFolder, load_records, load_settings, load_source
+from .run.folder import RunFolder, load_records, load_settings, load_source, load_stale, why_not_done
 from .run.lock import RunProgress, load_run_progress
 from .run.manifest import StageRecord, differing_settings
 from .system.memory import ALIGNED_TOGETHER, GAUSSIANS, NEEDS, memory_room, submap_size, window_size, windows_of
@@ -106,7 +106,8 @@ class RunStatus:
         seconds = {s.name: s.record.seconds for s in self.stages if s.record}
         gone = [f"{s.name} ({', '.join(s.newer)})" for s in self.stages if s.newer and not s.networks]
         kept = f"networks that were used are not installed any more, their results are kept: {', '.join(gone)}"
-        return ([_about_networks(self.run, new, seconds)] if new else []) + ([kept] if gone else [])
+        older = [f"older results are kept: {why_not_done(self.run, name)}" for name in list(load_stale(self.run))[:1]]
+        return older + ([_about_networks(self.run, new, seconds)] if new else []) + ([kept] if gone else [])
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; the records without their lists of files."""
@@ -141,7 +142,7 @@ def run_status(run: RunFolder, program: Program = lambda method: ()) -> RunStatu
     for name in STAGES:
         record = records.get(name)
         changed = tuple(differing_settings(record, config)) if record else ()
-        damaged = tuple(run.damaged(name))
+        damaged = tuple(run.damaged(name)) if record else ()
         expected = expected_mb(name, run, config) if "frames" in records else None
         state, why = _state(run, name, record, damaged), "" if changed or damaged else again.get(name, "")
         now = running if running and running.stage == name and record is None else None

@@ -148,8 +148,8 @@ class Calibration:
     `origin` is "given", "exif" or "self-calibrated"; `focal_sd` its standard deviation in pixels (0 when given);
     `distortion` the (k1, k2, p1, p2[, k3[, k4, k5, k6]]) that was removed from the frames, of a `fisheye` (k1, k2, k3,
     k4).
-    `directions`: in how many the camera looks at once, see `pipelines.geometry.rig`. `readout`: seconds of its rolling
-    shutter, see `pipelines.structure.rolling`.
+    `directions`: in how many the camera looks at once, see `pipelines.geometry.camera.Rig`. `readout`: seconds of its
+    rolling shutter, see `pipelines.sfm.rolling`.
     """
 
     intrinsics: Intrinsics

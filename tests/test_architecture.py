@@ -253,3 +253,49 @@ def test_files_stay_readable(path: Path) -> None:
             most = 110 if any(ast.unparse(d) == "kernel" for d in node.decorator_list) else 60
             length = (node.end_lineno or 0) - node.lineno
             assert length <= most, f"{node.name} is {length} lines"
+
+
+RUN_PATHS = {"root", "stage", "partial", "piece"}
+"""Of a `RunFolder`: what a name read from a file of the run could be joined to."""
+
+
+def is_of_run(node: ast.AST, named: set[str]) -> bool:
+    """Whether an expression is a folder of a run; `named`: variables that are."""
+    if isinstance(node, ast.Call):
+        return isinstance(node.func, ast.Attribute) and node.func.attr in RUN_PATHS
+    if isinstance(node, ast.Name):
+        return node.id in named
+    return isinstance(node, ast.Attribute) and node.attr == "root" and "run" in ast.unparse(node.value).lower()
+
+
+def joins_to_a_run(tree: ast.AST) -> Iterable[int]:
+    """Lines that join a name to a folder of a run, or to a variable that is one in the same function, by `/`,
+    `joinpath`, `with_name` or `Path(...)`."""
+    for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.Module)):
+        inside = list(ast.walk(function))
+        given = [n for n in inside if isinstance(n, ast.Assign) and is_of_run(n.value, set())]
+        is_module = isinstance(function, ast.Module)
+        named = {t.id for n in given for t in n.targets if isinstance(t, ast.Name) and not is_module}
+        for node in inside:
+            held: list[ast.AST] = []
+            if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
+                is_shown = isinstance(node.left, ast.Name) and isinstance(node.right, ast.Constant)
+                held = [] if is_shown else [node.left]
+            elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+                held = [node.func.value] if node.func.attr in ("joinpath", "with_name") else []
+            elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and len(node.args) > 1:
+                held = [node.args[0]] if node.func.id in ("Path", "RunFolder") else []
+            yield from (node.lineno for part in held if is_of_run(part, named))  # type: ignore[attr-defined]
+
+
+def test_names_are_joined_to_a_run_by_the_run_alone() -> None:
+    """`RunFolder.path` refuses names and links that lead out of the run, which may be from anybody."""
+    for text in (
+        "run.root / name", "run.stage('a') / name", "Path(self.run.root, name)", "run.root.joinpath(name)",
+        "def f():\n    folder = run.stage('a')\n    return folder / name",
+    ):  # fmt: skip
+        assert list(joins_to_a_run(ast.parse(text))), text
+    assert not list(joins_to_a_run(ast.parse("run.path(name), folder / name, root / 'x', run.root.parent")))
+    files = [p for room in ("pipelines", "msgs_cli") for p in (ROOT / room).rglob("*.py")]
+    trees = {p.relative_to(ROOT).as_posix(): ast.parse(p.read_text(encoding="utf-8")) for p in files}
+    assert [f"{name}:{line}" for name, tree in trees.items() for line in joins_to_a_run(tree)] == []

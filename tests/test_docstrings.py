@@ -50,3 +50,30 @@ def test_what_counts_as_a_docstring_without_a_subject() -> None:
     assert not any(
         map(says_nothing, ("Return the mean of two images.", "Offsets of the rows, (R,).", "Inner node of a tree."))
     )
+
+
+NAMED = re.compile(r"`+(?:msgs_slam\.)?((?:pipelines|formats|msgs_cli)(?:\.[a-z_0-9]+)+)")
+
+
+def exists(dotted: str) -> bool:
+    """Whether a dotted name is of a module or folder, or of something that one mentions."""
+    path = ROOT.joinpath(*dotted.split("."))
+    if path.is_dir() or path.with_suffix(".py").is_file():
+        return True
+    above = path.parent
+    file = above.with_suffix(".py") if above.with_suffix(".py").is_file() else above / "__init__.py"
+    return file.is_file() and re.search(rf"\b{path.name}\b", file.read_text(encoding="utf-8")) is not None
+
+
+def test_modules_that_code_names_are_there() -> None:
+    assert exists("pipelines.sfm.rolling")
+    assert exists("pipelines.system.jit.kernel")
+    assert not exists("pipelines.structure.rolling")
+    found = {
+        (str(path.relative_to(ROOT)), name)
+        for room in ("formats", "pipelines", "msgs_cli", "msgs_slam")
+        for path in (ROOT / room).glob("**/*.py")
+        for name in NAMED.findall(path.read_text(encoding="utf-8"))
+    }
+    assert len(found) > 5
+    assert {f"{path}: {name}" for path, name in found if not exists(name)} == set()

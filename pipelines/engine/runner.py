@@ -2,7 +2,6 @@
 
 import gc
 import resource
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,9 +12,10 @@ from typing import Any
 
 from ...formats.atomic import is_disk_full, remove_temporaries, write_text
 from ...formats.errors import DiskFullError, InputError, RecoverableError
+from ...formats.reading import links_in
 from ..config import STAGES, Config
 from ..run.ending import FINGERPRINT, empty, find_sealed, move_in, results, seal, unseal
-from ..run.folder import RunFolder, load_records, save_settings
+from ..run.folder import RunFolder, load_records, load_stale, save_settings
 from ..run.manifest import Manifest, Source, StageRecord, content_digest, finite_or_none, settings_of, write_manifest
 from ..system.memory import release_free_memory
 from ..system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log, stop_if_asked
@@ -54,47 +54,82 @@ def run_stages(
 
     A stage is up to date when its fingerprint (code, own settings, seed, own inputs, content of the stages before
     it) and its files are unchanged. Nothing of the run changes before everything that can be checked is; then the
-    settings are written, and a stage that has to run again is taken out of the manifest, with those after it, before
-    it starts. Raises InputError as the stages do.
+    settings are written, and the manifest calls a stage that has to run again stale, with those after it, before it
+    starts. Their folders stay until their own new results are ready; what still fits then counts again. Raises
+    InputError as the stages do.
     """
     run = RunFolder(run.root.absolute())  # tasks take it to processes with another working folder
-    records = load_records(run)
-    origin = Source(str(source), source_digest)
-    upstream = source_digest
+    upstream, book = source_digest, _Records(run, Source(str(source), source_digest))
+    records = book.current
     wanted = stages[: STAGES.index(until) + 1]
     inputs = _check_inputs(wanted, run, source, config, source_digest, same_source, redo)
     if run.manifest() is None:
-        write_manifest(run.manifest_file, Manifest(origin, records))
+        book.save()
     save_settings(run, config)
     settled = replace(config, run=replace(config.run, threads=config.run.threads or threads))
     reporter = StageReporter(progress, wanted, records, settled)
     for stage in wanted:
-        record = records.get(stage.name)
+        record = book.find(stage.name)
         why = "" if record is None else rerun_reason(stage, run, record, config, upstream, inputs[stage.name])
         why = why or ("as asked for" if stage.name == redo else "")
         if record is None or why:
             fingerprint = stage_fingerprint(stage, config, upstream, inputs[stage.name])
-            if why:
+            if why and stage.name in records:
                 log.warning("%s and what follows are made again (%s)", stage.name, why)
-            if _drop(records, stage.name):
-                write_manifest(run.manifest_file, Manifest(origin, records))
+            begun = stage.name not in records
+            book.set_aside(stage.name, keep=stage.name != redo)
             folder = run.partial(stage.name)
             context = StageContext(run, source, settled, folder, progress, [], stages, same_source, workers)
             with reporter.running(stage.name) as ended:
-                sealed = _find_ended(stage, run, config, fingerprint) if record is None else None
+                sealed = _find_ended(stage, run, config, fingerprint) if begun else None
                 record = sealed or _run_one(stage, context, fingerprint, inputs[stage.name], config)
                 move_in(run, stage.name)
                 ended(record)
-            records[stage.name] = record
-            write_manifest(run.manifest_file, Manifest(origin, records))
+            book.enter(stage.name, record)
             unseal(run, stage.name)
-            for later in STAGES[STAGES.index(stage.name) + 1 :]:  # made from what is no longer there
-                shutil.rmtree(run.stage(later), ignore_errors=True)
         else:
+            if stage.name not in records:
+                book.enter(stage.name, record)
             unseal(run, stage.name)
             reporter.report(stage.name, UP_TO_DATE)
         upstream = next_upstream(upstream, record)
     return records
+
+
+class _Records:
+    """The records of a run while its stages are brought up to date: the `current` ones, and the stale ones, each of
+    which holds the settings of all stages, with which it would count again."""
+
+    def __init__(self, run: RunFolder, origin: Source) -> None:
+        self._run, self._origin = run, origin
+        self.current, self._stale = load_records(run), load_stale(run)
+
+    def save(self) -> None:
+        """Write the manifest."""
+        write_manifest(self._run.manifest_file, Manifest(self._origin, self.current, self._stale))
+
+    def find(self, name: str) -> StageRecord | None:
+        """Return the record of the results in a stage's folder."""
+        return self.current.get(name) or self._stale.get(name)
+
+    def set_aside(self, name: str, keep: bool) -> None:
+        """Call a stage and those after it stale, or with `keep` False forget them, and save that."""
+        later = STAGES[STAGES.index(name) :]
+        settings = {stage: r.settings[stage] for stage, r in self.current.items() if stage in r.settings}
+        aside = {stage: self.current.pop(stage) for stage in later if stage in self.current}
+        if keep:
+            self._stale |= {stage: replace(r, settings=settings | r.settings) for stage, r in aside.items()}
+        else:
+            self._stale = {stage: r for stage, r in self._stale.items() if stage not in later}
+        if aside or not keep:
+            self.save()
+
+    def enter(self, name: str, record: StageRecord) -> None:
+        """Note that a stage is done, and save that."""
+        own = {section: values for section, values in record.settings.items() if section in ("run", name)}
+        self.current[name] = replace(record, settings=own)
+        self._stale.pop(name, None)
+        self.save()
 
 
 class StageReporter:
@@ -139,12 +174,6 @@ class StageReporter:
             raise
 
 
-def _drop(records: dict[str, StageRecord], name: str) -> bool:
-    """Take out this stage and those after it; whether there was any."""
-    dropped = [records.pop(later, None) for later in STAGES[STAGES.index(name) :]]
-    return any(record is not None for record in dropped)
-
-
 def _check_inputs(
     stages: list[Stage], run: RunFolder, source: Path, config: Config, upstream: str, same_source: SameSource, redo: str
 ) -> dict[str, Any]:
@@ -152,7 +181,9 @@ def _check_inputs(
 
     A finished stage whose inputs are gone (files deleted, a model removed) stays as it is.
     """
-    inputs, checks, records = {}, [], load_records(run)
+    for stage in stages:
+        run.partial(stage.name)  # refuses a link
+    inputs, checks, records = {}, [], {**load_stale(run), **load_records(run)}
     settled = True
     for stage in stages:
         record = records.get(stage.name)
@@ -229,7 +260,8 @@ def _open_partial(folder: Path, fingerprint: str) -> None:
     """Keep what an interrupted attempt at exactly this work has left in the unfinished folder, else empty it. Every
     file there is whole, for it has been flushed to the disk before it took its name."""
     stamp = folder / FINGERPRINT
-    if not (stamp.exists() and stamp.read_text(encoding="utf-8", errors="replace") == fingerprint):
+    same = stamp.is_file() and stamp.read_text(encoding="utf-8", errors="replace") == fingerprint
+    if not same or any(links_in(folder)):  # the program makes none, and would write through those of somebody else
         empty(folder)
         write_text(stamp, fingerprint)
     remove_temporaries(folder)

@@ -49,11 +49,11 @@ def rerun_reason(
     """Why a finished stage has to be made again, "" where it has not; `inputs` are those of now."""
     if not run.stage(stage.name).exists():
         return "its folder is gone"
-    if damaged := run.damaged(stage.name):
-        return f"{len(damaged)} of its files are missing or damaged"
     kept = effective_inputs(stage, config, record, inputs)
     if record.fingerprint != stage_fingerprint(stage, config, upstream, kept):
         return _what_differs(stage, record, config, upstream)
+    if damaged := run.damaged(stage.name):  # last, for it reads all of them
+        return f"{len(damaged)} of its files are missing or damaged"
     return divided_otherwise(stage, run, record, config)
 
 

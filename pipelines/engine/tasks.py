@@ -14,7 +14,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 
 from ...formats.atomic import unique_temp_names
 from ...formats.errors import InputError, RecoverableError
+from ...formats.reading import resolve_own
 from ...formats.textfile import read_json, write_json
 from ..config import STAGES, Config
 from ..run.folder import RunFolder
@@ -216,7 +217,8 @@ class TaskBoard:
 
     def _do_locked(self, number: int, header: dict[str, Any], prepare: Callable[[str], Progress]) -> None:
         """Raises RecoverableError where this process cannot do the task; what else the work raises is a bug."""
-        kind, folder = header["work"].rpartition(":")[2], self.folder.parents[1] / header["folder"]
+        root = self.folder.parents[1]
+        kind, folder = header["work"].rpartition(":")[2], resolve_own(root, header["folder"])
         progress = prepare(name := f"{kind} {number + 1}")
         try:
             require_same_world([folder], header["code"])
@@ -228,7 +230,7 @@ class TaskBoard:
             raise InputError(
                 f"{self.folder / _HEADER}: {header['work']} is not a task of this program. Delete {self.folder}"
             )
-        task = load_value(self.task(number))
+        _require_inside(root, task := load_value(self.task(number)))
         # On a disk without locks another process may do the same task.
         with stopping_after_writes(folder), unique_temp_names():
             try:
@@ -241,7 +243,7 @@ class TaskBoard:
         """Let no process take a task any more; waits for those that work on one, and removes the board."""
         with suppress(FileNotFoundError):
             (self.folder / _HEADER).unlink()
-        for lock in sorted(self.folder.glob("*.lock")):
+        for lock in (path for path in sorted(self.folder.glob("*.lock")) if not path.is_symlink()):
             with lock.open("ab") as stream:
                 while not take_lock(stream):
                     stop_if_asked()
@@ -258,8 +260,18 @@ class TaskBoard:
 def boards_in(run: RunFolder) -> list[TaskBoard]:
     """Find the task boards of a run, published now or left by an earlier leader."""
     with suppress(FileNotFoundError):
-        return [TaskBoard(folder) for folder in sorted((run.root / _TASKS).iterdir())]
+        found = sorted(run.path(_TASKS).iterdir())
+        return [TaskBoard(folder) for folder in found if folder.is_dir() and not folder.is_symlink()]
     return []
+
+
+def _require_inside(root: Path, task: Any) -> None:
+    """Raise InputError for a task that would write elsewhere than in the run."""
+    held = [value for name, value in vars(task).items() if name != "source"] if is_dataclass(task) else []
+    places = [value.root if isinstance(value, RunFolder) else value for value in held]
+    for place in places:
+        if isinstance(place, Path) and not place.resolve().is_relative_to(root.resolve()):
+            raise InputError(f"{root}: a task is of {place}, outside of the run. Delete {root / _TASKS}")
 
 
 def require_same_world(folders: Sequence[Path], code: str) -> None:

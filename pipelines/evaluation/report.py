@@ -146,7 +146,7 @@ def _heading(outcome: Outcome) -> str:
 
 def _page_link(run: RunFolder, report: Path) -> str:
     """The map's page, where the report lies beside the export."""
-    if report.resolve().parent != run.root.resolve() or not (run.stage("export") / WEB_PAGE).exists():
+    if report.resolve().parent != run.root.resolve() or not run.has("export", WEB_PAGE):
         return ""
     return f'<p><a href="export/{WEB_PAGE}">The map in one page</a>, to look at and to send.</p>'
 

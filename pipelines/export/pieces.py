@@ -5,7 +5,6 @@ are those of any run, and so is all that reads it.
 """
 
 from dataclasses import replace
-from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -30,6 +29,7 @@ from ..run.files import (
     save_frames,
 )
 from ..run.folder import RunFolder, load_records
+from ..run.manifest import piece_digest
 from ..scene.world import FIRST
 from ..system.progress import WithinStage
 from .writers import write_colmap, write_trajectory
@@ -57,13 +57,12 @@ def make_pieces(context: StageContext) -> list[RunFolder]:
             discard(old)
     records, made = load_records(run), []
     for name in names:
-        piece = RunFolder(run.root / name)
+        piece = run.piece(name)
         piece.root.mkdir(exist_ok=True)
-        origin = sha256(f"{name} {records['frames'].content} {records['tracking'].content}".encode()).hexdigest()
         stages = [Stage("frames", take_frames), *context.stages[1:]]
         try:
             inside = WithinStage(context.progress, name)
-            run_stages(stages, piece, context.source, origin, _settings(context.config), inside)
+            run_stages(stages, piece, context.source, piece_digest(records, name), _settings(context.config), inside)
         except RecoverableError:
             raise
         except InputError as error:

@@ -3,7 +3,6 @@
 import hashlib
 import tempfile
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +16,7 @@ from ..networks.registry import metric_card
 from ..outcome import Outcome, load_outcome
 from ..run.files import METRES, SUBMAPS
 from ..run.folder import RunFolder
-from ..run.lock import locked
+from ..run.lock import locked_export
 from ..run.target import Target, read_list
 from ..scene.gps import world_on_earth
 from ..scene.metres import find_metres
@@ -173,13 +172,13 @@ def export_run(
 
     Settings are the run's own where none are given. What is written takes the place of an earlier export; of other
     files only where they may be overwritten (see `Target`). Nothing changes before all of it is made. Raises InputError
-    for a run without a map, for a folder that holds such files of somebody else, or the run's source, and for the run's
-    own export while another process works on the run.
+    for a run without a map, and for a folder that holds such files of somebody else, or the run's source; RunBusyError
+    where the folder is the run's own and another process works on the run.
     """
     is_own = folder.resolve() == run.stage("export").resolve()
     if IMAGES in names_of([only] if only else None) and is_of_source(folder / IMAGES, run):
         raise InputError(f"{folder / IMAGES} is the source of {run.root}: name another folder with --to")
-    with locked(run) if is_own else nullcontext():
+    with locked_export(run, folder):
         outcome, world, settings = _exported(run, settings)
         kinds = [only] if only else kinds_of_run(outcome, settings)
         names = names_of(kinds, with_notes=not only)

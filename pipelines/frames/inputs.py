@@ -19,10 +19,13 @@ from .masks import check_masks, mask_inputs
 
 
 def frames_inputs(source: Path, config: Config) -> dict[str, str] | None:
-    """Return digests of the user's masks, poses and camera and of the networks, and what an extended run was."""
+    """Return digests of the user's masks, poses and camera and of the networks, what an extended run was, and how the
+    source is read where that is not left to its looks."""
     settings = config.frames
+    how = {} if config.run.format == "auto" else {"format": config.run.format}
     given = pose_inputs(settings) | intrinsics_inputs(settings.intrinsics)
-    return (mask_inputs(source, config) or {}) | learned_inputs(settings) | given | parent_inputs(source) or None
+    masks = mask_inputs(source, config) or {}
+    return masks | learned_inputs(settings) | given | parent_inputs(source) | how or None
 
 
 def frames_division(run: RunFolder, config: Config) -> list[range]:

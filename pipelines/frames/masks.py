@@ -90,8 +90,8 @@ class FrameMasks:
 
     @property
     def judged(self) -> dict[str, int] | None:
-        """Counts of the regions of keyframes that the networks name, of those that stand still and that move for sure, and
-        the `matches` of keyframes with all of them; None before `leave_out`."""
+        """Counts of the regions of keyframes that the networks name, of those that stand still and of those that surely
+        move, and the `matches` of keyframes with all of them; None before `leave_out`."""
         return read_json(self._table) if self._table.exists() else None
 
     @property

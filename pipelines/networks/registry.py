@@ -14,7 +14,7 @@ from typing import Any
 
 from ...formats.atomic import atomic_path
 from ...formats.errors import InputError
-from ...formats.reading import file_sha256, reaching, require_file
+from ...formats.reading import file_sha256, reaching, require_file, user_cache
 from ...formats.textfile import read_json_object, write_json
 from .card import Card, card_from_values
 
@@ -296,7 +296,11 @@ def _room_classes(count: int) -> dict[str, list[str]]:
 
 
 def default_cache() -> Path:
-    """`$MSGS_SLAM_CACHE`, else `msgs-slam` in the user's cache folder."""
+    """`$MSGS_SLAM_CACHE`, else `msgs-slam` in the user's cache folder. Raises InputError where there is neither."""
     if own := os.environ.get("MSGS_SLAM_CACHE"):
         return Path(own)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "msgs-slam"
+    if (place := user_cache()) is None:
+        raise InputError(
+            "this user has no home folder, in which networks would be kept: set MSGS_SLAM_CACHE to a folder for them"
+        )
+    return place / "msgs-slam"

@@ -28,13 +28,16 @@ from .selection import (
 
 
 def proxy_inputs(source: Path, config: Config) -> dict[str, Any]:
-    """Values that change with what the providers read: the files' names and contents, the network and its card.
+    """Values that change with what the providers read: the files' names and contents, the network and its card, and
+    whether people are looked for, who are then no class of the scene.
 
     Raises InputError for folders and files that do not fit the source, and for a card that is none.
     """
     depth, semantics = choose_depth(config.proxy), choose_semantics(config.proxy)
     chosen = {"depth": depth, "labels": semantics}
     identities = {k: c.kind if c.card is None else card_identity(c.card) for k, c in chosen.items()}
+    if config.frames.people != "auto":
+        identities["people"] = config.frames.people
     if "files" in (depth.kind, semantics.kind):
         around = _before_frames(source, config)
         if depth.kind == "files":

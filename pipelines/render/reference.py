@@ -9,7 +9,6 @@ increasing depth, ties by index. A pixel takes no more of them once its transmit
 TRANSMITTANCE_MIN.
 """
 
-import warnings
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -17,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ...formats.quiet import ignored_warnings
 from .notes import Notes
 
 ALPHA_MIN = 1 / 255
@@ -179,6 +179,5 @@ class _Blend(torch.autograd.Function):
 
 
 def _sparse_rows(ends: Tensor, columns: Tensor, values: Tensor, size: tuple[int, int]) -> Tensor:
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+    with ignored_warnings("Sparse CSR tensor support is in beta"):
         return torch.sparse_csr_tensor(ends, columns, values, size, check_invariants=False)

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from ...formats.errors import InputError
 from ...formats.reading import file_sha256, parsing
-from ...formats.textfile import read_json_object, write_json
+from ...formats.textfile import MAX_OWN_JSON_BYTES, read_json_object, write_json
 from ..config import STAGES
 from ..system.progress import log
 from .folder import RunFolder
@@ -53,7 +53,7 @@ def find_sealed(run: RunFolder, name: str, fingerprint: str) -> StageRecord | No
     or a file is not as it says."""
     for folder in (run.partial(name), run.stage(name)):
         with suppress(InputError), parsing(folder / RECORD, "record of a stage"):
-            record = dataclass_from_json(StageRecord, read_json_object(folder / RECORD, limit=None))
+            record = dataclass_from_json(StageRecord, read_json_object(folder / RECORD, MAX_OWN_JSON_BYTES))
             if record.fingerprint != fingerprint or content_digest(record.files) != record.content:
                 continue
             found = results(folder)
@@ -78,7 +78,7 @@ def move_in(run: RunFolder, name: str) -> None:
 
 def _keep_others(old: Path, new: Path) -> None:
     """What people keep beside the exported files, and exports on request, stay when the stage is made again."""
-    record = dataclass_from_json(StageRecord, read_json_object(new / RECORD, limit=None))
+    record = dataclass_from_json(StageRecord, read_json_object(new / RECORD, MAX_OWN_JSON_BYTES))
     if kept := keep_others(old, new, record.files):
         log.warning(
             "%s stays in %s, as it was made before: msgs-slam export --only makes it again", ", ".join(kept), old
@@ -88,7 +88,7 @@ def _keep_others(old: Path, new: Path) -> None:
 def unseal(run: RunFolder, name: str) -> None:
     """Remove the record from the folder of a stage that the manifest names."""
     with suppress(OSError):
-        (run.stage(name) / RECORD).unlink(missing_ok=True)
+        run.path(name, RECORD).unlink(missing_ok=True)
 
 
 def _flush_folder(folder: Path) -> None:

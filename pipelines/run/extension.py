@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...formats.atomic import copy_file
 from ...formats.errors import InputError
-from ...formats.reading import file_sha256
+from ...formats.reading import file_sha256, resolve_own
 from ...formats.textfile import read_json_object, write_json
 from ..config import SOURCE_LIST
 from ..types import Calibration, Frame
@@ -49,10 +49,10 @@ class ParentRun:
     @cached_property
     def contents(self) -> Mapping[str, Any]:
         """{"camera", "files": name → sha256}."""
-        return read_json_object(self.folder / CONTENTS)
+        return read_json_object(resolve_own(self.folder, CONTENTS))
 
     def _read(self, file: RunFile[T]) -> T:
-        path = self.folder / file.name
+        path = resolve_own(self.folder, file.name)
         if not path.is_file() or file_sha256(path) != self.contents["files"].get(file.name):
             raise InputError(
                 f"{path} is gone or damaged: the run can no longer be extended from it. Reconstruct all videos into "

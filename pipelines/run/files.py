@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.atomic import write_text
+from ...formats.reading import is_plain_name
 from ..geometry.sparse_model import FrameObservations, SparseModel
 from ..types import (
     VOID,
@@ -52,6 +53,8 @@ def _frames(rows: Any) -> list[Frame]:
     frames = [dataclass_from_json(Frame, row) for row in rows]
     if [f.id for f in frames] != list(range(len(frames))):
         raise ValueError("the frames are not counted from 0")
+    if bad := [f.name for f in frames if not is_plain_name(f.name)]:  # files are copied and removed by these names
+        raise ValueError(f"the frame {bad[0][:100]!r} has no plain name")
     return frames
 
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ...formats.atomic import write_text
 from ...formats.errors import InputError
 from ...formats.images import read_rgb
-from ...formats.reading import file_sha256
+from ...formats.reading import file_sha256, require_no_link, resolve_own
 from ...formats.textfile import read_toml
 from ..config import EXTENSION, SOURCE_LIST, Config
 from ..read_config import UnknownSettingError, config_to_toml, merge_known_settings
@@ -30,7 +30,7 @@ from ..system.progress import log
 from ..system.wording import quoted
 from ..types import Frame, ProxyMaps, any_of
 from .files import LEFT_OUT, PROXY_MAPS, SPARSE
-from .manifest import Manifest, Source, StageRecord, read_manifest, recorded_config
+from .manifest import Manifest, Source, StageRecord, previous_settings, read_manifest, recorded_config
 from .schema import RunFile
 
 T = TypeVar("T")
@@ -58,13 +58,22 @@ class RunFolder:
         """The folder's whole path, which has a name: "." has none."""
         return Path(os.path.abspath(self.root))
 
+    def path(self, *names: str) -> Path:
+        """Return the path of a file or folder of the run, there or not. Raises InputError for one that would lie
+        outside of it, by its name or by a link: the run may be anybody's."""
+        return resolve_own(self.root, "/".join(names))
+
     def stage(self, name: str) -> Path:
-        """Folder of a finished stage."""
-        return self.root / name
+        """Folder of a finished stage. Raises as `path`."""
+        return self.path(name)
 
     def partial(self, name: str) -> Path:
-        """Folder of an unfinished stage."""
-        return self.root / f"{name}.partial"
+        """Folder of an unfinished stage. Raises as `path`."""
+        return self.path(f"{name}.partial")
+
+    def piece(self, name: str) -> "RunFolder":
+        """Return the run inside this one that a disconnected component is. Raises as `path`."""
+        return RunFolder(self.path(name))
 
     @property
     def settings_file(self) -> Path:
@@ -76,16 +85,17 @@ class RunFolder:
 
     @property
     def evaluation_file(self) -> Path:
-        return self.root / "evaluation" / "evaluation.json"
+        return self.path("evaluation", "evaluation.json")
 
     @property
     def report_file(self) -> Path:
-        return self.root / "report.html"
+        return self.path("report.html")
 
     def manifest(self) -> Manifest | None:
         """None before there is any. Raises InputError for a damaged one."""
         if not self.manifest_file.exists():
             return None
+        require_no_link(self.manifest_file)
         stamp = _stamp(self.manifest_file)
         if stamp not in self._manifest:
             manifest = read_manifest(self.manifest_file)
@@ -97,7 +107,7 @@ class RunFolder:
         """Whether the finished stage has left a file of that name, be it there still or not."""
         manifest = self.manifest()
         if manifest is None:
-            return (self.stage(stage) / name).exists()
+            return self.path(stage, name).exists()
         return stage in manifest.records and name in manifest.records[stage].files
 
     def file(self, stage: str, name: str) -> Path:
@@ -107,13 +117,13 @@ class RunFolder:
         megabyte takes a millisecond, which is less than anything that is done with it takes. Raises InputError when
         it is not as the stage left it. Without a manifest there is nothing to compare with, and no command goes on.
         """
-        path, manifest = self.stage(stage) / name, self.manifest()
+        path, manifest = self.path(stage, name), self.manifest()
         if manifest is None:
             return path
         if stage not in manifest.records:
-            raise InputError(f"{self.root}: {stage} is not done. Run `msgs-slam resume {quoted(self.root)}` first")
+            raise InputError(f"{self.root}: {why_not_done(self, stage)}")
         expected = manifest.records[stage].files.get(name)
-        if expected is None or not self._is_intact(path, *expected):
+        if expected is None or not self._is_intact(stage, name, *expected):
             what = "is gone" if not path.is_file() else "is not as the program left it: damaged or changed"
             raise InputError(
                 f"{path} {what}. Run `msgs-slam resume {quoted(self.root)}`: {stage} and what follows are made again"
@@ -121,13 +131,14 @@ class RunFolder:
         return path
 
     def damaged(self, stage: str) -> list[str]:
-        """Names of the files of a finished stage that are gone or not as it left them. Reads all of them. Those of the
-        pieces, runs inside the run, count for the export, which makes them."""
+        """Names of the files of a finished stage, or a stale one, that are gone or not as it left them. Reads all of
+        them. Those of the pieces, runs inside the run, count for the export, which makes them."""
         manifest = self.manifest()
-        files = manifest.records[stage].files if manifest and stage in manifest.records else {}
-        own = [name for name, expected in files.items() if not self._is_intact(self.stage(stage) / name, *expected)]
+        ended = {**manifest.stale, **manifest.records} if manifest else {}
+        files = ended[stage].files if stage in ended else {}
+        own = [name for name, expected in files.items() if not self._is_intact(stage, name, *expected)]
         names = {name.partition("/")[0] for name in files if stage == "export" and name.startswith("piece_")}
-        return own + [f"../{name}/{file}" for name in sorted(names) for file in RunFolder(self.root / name)._wrong()]
+        return own + [f"../{name}/{file}" for name in sorted(names) for file in self.piece(name)._wrong()]
 
     def _wrong(self) -> list[str]:
         """The same over all stages, inside the run."""
@@ -140,14 +151,15 @@ class RunFolder:
         """Whether this is a run inside another one."""
         return self.place.name.startswith("piece_") and RunFolder(self.place.parent).manifest_file.exists()
 
-    def _is_intact(self, path: Path, size: int, digest: str) -> bool:
+    def _is_intact(self, stage: str, name: str, size: int, digest: str) -> bool:
         try:
+            path = self.path(stage, name)
             stamp = _stamp(path)
             if stamp[1] != size or not path.is_file():
                 return False
             if (known := self._digests.get(path)) is None or known[0] != stamp:
                 known = self._digests[path] = (stamp, file_sha256(path))
-        except OSError:
+        except (OSError, InputError):
             return False
         return known[1] == digest
 
@@ -196,6 +208,27 @@ def load_records(run: RunFolder) -> dict[str, StageRecord]:
     return {} if manifest is None else dict(manifest.records)
 
 
+def load_stale(run: RunFolder) -> dict[str, StageRecord]:
+    """Load the stages whose results are of before a stage ahead of them was made again, by name."""
+    manifest = run.manifest()
+    return {} if manifest is None else dict(manifest.stale)
+
+
+def why_not_done(run: RunFolder, stage: str) -> str:
+    """Say that a stage is not done, and how to come to its results: of one whose results are stale also the settings
+    with which they count again."""
+    manifest, resume = run.manifest(), f"msgs-slam resume {quoted(run.root)}"
+    stale = manifest.stale if manifest is not None else {}
+    if stage not in stale:
+        return f"{stage} is not done. Run `{resume}` first"
+    changed = previous_settings(stale[stage], load_settings(run))
+    back = f", or go back with `{resume} {' '.join(f'--set {quoted(text)}' for text in changed)}`" if changed else ""
+    return (
+        f"{stage} is not done: what is in {run.stage(stage)} was made before the run was changed, and does not belong "
+        f"to what it holds now. Run `{resume}` to make it again{back}"
+    )
+
+
 def load_source(run: RunFolder) -> Source:
     """Load the source of a run. Raises InputError for a folder that is not a run."""
     manifest = run.manifest()
@@ -204,8 +237,8 @@ def load_source(run: RunFolder) -> Source:
     if path.name != SOURCE_LIST:
         return source
     # The list of several videos is in the run, wherever that has been moved to.
-    folder = run.root / path.parent.name if path.parent.name.startswith(EXTENSION) else run.root
-    return replace(source, path=str(folder / SOURCE_LIST)) if (folder / SOURCE_LIST).is_file() else source
+    place = (path.parent.name, SOURCE_LIST) if path.parent.name.startswith(EXTENSION) else (SOURCE_LIST,)
+    return replace(source, path=str(found)) if (found := run.path(*place)).is_file() else source
 
 
 def save_settings(run: RunFolder, config: Config) -> None:
@@ -232,6 +265,7 @@ def load_settings(run: RunFolder) -> Config:
         log.warning("%s is gone: stages that are not done get default settings", file)
         return recorded_config(records, Config())
     try:
+        require_no_link(file)
         values = read_toml(file)
         is_complete = all(f.name in values.get(name, {}) for name, s in vars(Config()).items() for f in fields(s))
         if not is_complete and _LAST_LINE.encode().strip() not in file.read_bytes():

@@ -13,16 +13,18 @@ import signal
 import threading
 import time
 from collections.abc import Iterable, Iterator, Sized
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, TypeVar
 
 from ...formats.atomic import machine_token, process_token
 from ...formats.errors import InputError, RecoverableError
+from ...formats.reading import links_in, require_no_link
 from ...formats.textfile import read_json
+from ..config import STAGES
 from ..system.progress import BEGUN, Progress, StageEvent, about, log
-from .folder import RunFolder, load_records
+from .folder import RunFolder, load_records, load_stale, why_not_done
 from .schema import dataclass_from_json
 
 T = TypeVar("T")
@@ -52,8 +54,8 @@ def locked(run: RunFolder) -> Iterator[None]:
     another process does, or when the folder cannot be written.
     """
     made = make_folder(run.root)
-    with _open(run.root / LOCK) as stream, _alone(stream, run.root) as alone:
-        if not alone or not _still_there(stream, run.root / LOCK):
+    with _open(run.path(LOCK)) as stream, _alone(stream, run) as alone:
+        if not alone or not _still_there(stream, run.path(LOCK)):
             raise RunBusyError(f"{run.root}: another msgs-slam process is working on this run. Wait for it to end")
         try:
             yield
@@ -63,6 +65,31 @@ def locked(run: RunFolder) -> Iterator[None]:
             if made and (not begun or (unusable and not load_records(run))):
                 shutil.rmtree(run.root, ignore_errors=True)
             raise
+
+
+@contextmanager
+def locked_export(run: RunFolder, folder: Path) -> Iterator[None]:
+    """Hold the run's lock in this block where `folder`, which files are written to, is the run's own export: the stage
+    would replace it meanwhile.
+
+    Raises RunBusyError where another process works on the run, InputError where that export is of an earlier result of
+    the stages before it, or holds links.
+    """
+    own = run.stage(STAGES[-1])
+    if folder.resolve() != own.resolve():
+        yield
+        return
+    elsewhere = "or write to another folder with --to DIR"
+    with ExitStack() as held:
+        try:
+            held.enter_context(locked(RunFolder(run.place.parent) if run.is_piece else run))
+        except RunBusyError as error:
+            raise RunBusyError(f"{error}, {elsewhere}") from error
+        if STAGES[-1] in load_stale(run):
+            raise InputError(f"{why_not_done(run, STAGES[-1])}, {elsewhere}: other files would be mixed with these")
+        if link := next(links_in(own), None):
+            require_no_link(link)
+        yield
 
 
 def make_folder(root: Path) -> bool:
@@ -91,7 +118,7 @@ def _open(path: Path) -> IO[bytes]:
 
 
 @contextmanager
-def _alone(stream: IO[bytes], root: Path) -> Iterator[bool]:
+def _alone(stream: IO[bytes], run: RunFolder) -> Iterator[bool]:
     """Whether no other process leads."""
     taken = _take(stream)
     for _ in range(_LOOKS):  # who only asks whether somebody leads holds it for a moment
@@ -102,18 +129,18 @@ def _alone(stream: IO[bytes], root: Path) -> Iterator[bool]:
     if taken is not None:
         yield taken
         return
-    with leading(root / LEADER) as alone:
+    with leading(run.path(LEADER)) as alone:
         yield alone
 
 
 def is_led(run: RunFolder) -> bool:
     """Whether a process works on the run now, by its lock; where there are none, by the sign of life."""
     try:
-        with _open_existing(run.root / LOCK) as stream:
+        with _open_existing(run.path(LOCK)) as stream:
             taken = _take(stream)
     except OSError:  # nobody ever did, or it may not be read
         return False
-    return shows_life(run.root / LEADER) if taken is None else not taken
+    return shows_life(run.path(LEADER)) if taken is None else not taken
 
 
 def _open_existing(path: Path) -> IO[bytes]:
@@ -274,7 +301,7 @@ class ProgressFile:
     The file goes with the block."""
 
     def __init__(self, progress: Progress, run: RunFolder) -> None:
-        self._progress, self._file = progress, run.root / PROGRESS
+        self._progress, self._file = progress, run.path(PROGRESS)
         self._event: StageEvent | None = None
         self._written = 0.0
 
@@ -307,13 +334,15 @@ class ProgressFile:
         now = RunProgress(self._event.name, label, done, of, float(self._event.left() or 0.0))
         temporary = self._file.with_suffix(".tmp")
         with suppress(OSError):  # who works must not stop for who watches
-            temporary.write_text(json.dumps(asdict(now)), encoding="utf-8")
+            temporary.unlink(missing_ok=True)  # never through a link that was there
+            with temporary.open("x", encoding="utf-8") as file:
+                file.write(json.dumps(asdict(now)))
             os.replace(temporary, self._file)
 
 
 def load_run_progress(run: RunFolder) -> RunProgress | None:
     """Load the progress of the process at work; None where there is none, or no stage has started."""
-    path = Path(run.root / PROGRESS)
+    path = run.path(PROGRESS)
     if not path.exists() or not is_led(run):
         return None
     with suppress(InputError, ValueError):

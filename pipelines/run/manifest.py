@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ...formats.errors import InputError
-from ...formats.reading import parsing
-from ...formats.textfile import read_json_object, write_json
+from ...formats.reading import is_plain_path, parsing
+from ...formats.textfile import MAX_OWN_JSON_BYTES, read_json_object, write_json
 from ..config import STAGES, Config, config_to_dict
 from ..read_config import merge_known_settings
 from ..system.wording import quoted
@@ -31,7 +31,7 @@ class Source:
 @dataclass(frozen=True)
 class StageRecord:
     """One finished stage. files: relative path → [bytes, sha256]; settings: {"run": ..., its own section: ...}, those
-    that it was made with, whatever run.toml says by now."""
+    that it was made with, whatever run.toml says by now; of a stale one the sections of the other stages, too."""
 
     fingerprint: str
     files: dict[str, tuple[int, str]]
@@ -46,16 +46,18 @@ class StageRecord:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Source of a run, and its finished stages by name, in their order."""
+    """Source of a run, and its finished stages by name, in their order. stale: those whose results are still in their
+    folders, but a stage before them is being made again, or has been: they count again where it comes out the same."""
 
     source: Source
     records: dict[str, StageRecord]
+    stale: dict[str, StageRecord] = field(default_factory=dict)
 
 
 def read_manifest(path: Path) -> Manifest:
     """Raises InputError when it is missing, damaged, or of a newer version."""
     try:
-        value = read_json_object(path, limit=None)  # its checksum is in it
+        value = read_json_object(path, MAX_OWN_JSON_BYTES)
         with parsing(path, "manifest of a run", "it was damaged or edited"):
             return _manifest(path, value)
     except InputError as error:
@@ -70,17 +72,29 @@ def _manifest(path: Path, value: dict[str, Any]) -> Manifest:
         raise InputError(f"{path}: its format is {str(found)[:20]}, this version of the program knows {FORMAT}")
     if value.pop("check", None) != _check(value):
         raise ValueError("its checksum differs")
-    stages = value["stages"]
-    records = {name: dataclass_from_json(StageRecord, stages[name]) for name in STAGES if name in stages}
-    return Manifest(dataclass_from_json(Source, value["source"]), records)
+    records, stale = _records(value["stages"]), _records(value.get("stale", {}))
+    return Manifest(dataclass_from_json(Source, value["source"]), records, stale)
+
+
+def _records(values: dict[str, Any]) -> dict[str, StageRecord]:
+    records = {name: dataclass_from_json(StageRecord, values[name]) for name in STAGES if name in values}
+    for record in records.values():
+        if bad := next((name for name in record.files if not is_plain_path(name)), None):
+            raise ValueError(f"it names the file {bad[:100]!r}, which may lie outside of the run")
+    return records
 
 
 def write_manifest(path: Path, manifest: Manifest) -> None:
     """Atomically, with a checksum over itself. Raises InputError when the disk refuses."""
-    stages = {name: asdict(manifest.records[name]) for name in STAGES if name in manifest.records}
-    value = {"format": FORMAT, "source": asdict(manifest.source), "stages": stages}
+    value = {"format": FORMAT, "source": asdict(manifest.source), "stages": _in_order(manifest.records)}
+    if manifest.stale:
+        value["stale"] = _in_order(manifest.stale)
     value = json.loads(json.dumps(value, allow_nan=False))  # tuples are lists when it is read again
     write_json(path, {**value, "check": _check(value)})
+
+
+def _in_order(records: Mapping[str, StageRecord]) -> dict[str, Any]:
+    return {name: asdict(records[name]) for name in STAGES if name in records}
 
 
 def _check(value: Mapping[str, Any]) -> str:
@@ -109,6 +123,23 @@ def differing_settings(record: StageRecord, config: Config) -> list[str]:
         for key, value in config_to_dict(getattr(config, section)).items()
         if values.get(key, value) != value
     ]
+
+
+def previous_settings(record: StageRecord, config: Config) -> list[str]:
+    """`section.key=value` of each setting of which `config` has another value than the record, with that of the
+    record."""
+    keys = [text.partition("=")[0].partition(".") for text in differing_settings(record, config)]
+    return [f"{section}.{key}={_typed(record.settings[section][key])}" for section, _, key in keys]
+
+
+def _typed(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def piece_digest(records: Mapping[str, StageRecord], name: str) -> str:
+    """Digest of what the piece `name` of a run with these records is made from."""
+    text = f"{name} {records['frames'].content} {records['tracking'].content}"
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def content_digest(files: Mapping[str, tuple[int, str]]) -> str:

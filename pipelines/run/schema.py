@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ...formats.images import read_grey_png, write_grey_png
-from ...formats.reading import parsing
+from ...formats.reading import is_plain_name, parsing
 from ...formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
-from ...formats.textfile import read_json, write_json
+from ...formats.textfile import MAX_OWN_JSON_BYTES, read_json, write_json
 
 T = TypeVar("T")
 _KINDS = {"f": "f", "i": "iu", "b": "b", "u": "U"}
@@ -48,7 +48,9 @@ class RunFile(Generic[T]):
     layout: Mapping[str, str] = field(default_factory=dict)
 
     def path(self, folder: Path, of: int | str = "") -> Path:
-        """Return the file's path in a stage's folder."""
+        """Return the file's path in a stage's folder. Raises InputError for a frame without a plain name."""
+        if isinstance(of, str) and of and not is_plain_name(of):
+            raise InputError(f"{folder} names the frame {of[:300]!r}, which no file can be called: use a whole copy")
         return folder / self.name.format(of)
 
     def save(self, folder: Path, value: T, of: int | str = "") -> Path:
@@ -72,7 +74,7 @@ class RunFile(Generic[T]):
 
 
 _FORMATS: dict[str, tuple[Callable[[Path], Any], Callable[[Path, Any], None]]] = {
-    ".json": (partial(read_json, limit=None), write_json),
+    ".json": (partial(read_json, limit=MAX_OWN_JSON_BYTES), write_json),
     ".npz": (partial(load_arrays, own=True), save_arrays),
     ".png": (read_grey_png, write_grey_png),
     ".safetensors": (load_tensors, save_tensors),

@@ -30,7 +30,7 @@ class SeenFrame:
 
 @dataclass(frozen=True)
 class Scene:
-    """kind (V,): floor, ceiling, … of `regions.structure`; label (V,) class of each voxel or VOID; names of the
+    """kind (V,): floor, ceiling, … of `SegmentLabels.structure`; label (V,) class of each voxel or VOID; names of the
     classes; centres (N, 3) of the cameras; median_depth of what they see. `is_named`: whether
     something that knows things gave the names, and not the geometry."""
 

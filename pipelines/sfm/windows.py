@@ -1,7 +1,7 @@
 """Structure from motion of a long recording in windows: each mapped by itself, then joined by what they share.
 
 A mapper's memory grows by half a megabyte to two a keyframe, nearly all of it in its adjustments, so that no more than
-one window is in work at any time. What is joined is adjusted by `pipelines.structure.bundle`, which needs a tenth.
+one window is in work at any time. What is joined is adjusted by `pipelines.sfm.bundle`, which needs a tenth.
 """
 
 import math

@@ -15,7 +15,7 @@ from ...formats.errors import InputError
 from ...formats.image_folder import frame_number
 from ...formats.names import match_names, stem
 from ...formats.poses import PoseFile, read_poses
-from ...formats.reading import file_sha256, files_sha256, home_expanded, reaching
+from ...formats.reading import file_sha256, files_sha256, home_expanded, noting_files, reaching
 from ...formats.textfile import read_rows
 from ..config import FramesConfig
 from ..types import Frame, GivenPoses
@@ -94,14 +94,14 @@ def check_poses(config: FramesConfig, source: Source) -> None:
 
 
 def pose_inputs(config: FramesConfig) -> dict[str, str]:
-    """Return the digest of the pose files; {} where none are given. Raises InputError where they are gone."""
+    """Return the digest of the files that `read_poses` reads; {} where none are given. Raises InputError as it does."""
     if not config.poses:
         return {}
     path = home_expanded(config.poses)
-    if not path.exists():
-        raise InputError(f"--poses {path}: there is no such file or folder: check the spelling")
-    files = sorted(p for p in path.rglob("*") if p.suffix in (".bin", ".txt", ".json")) if path.is_dir() else [path]
-    return {"poses": files_sha256((p.name, p) for p in files)}
+    with noting_files() as files:
+        read_poses(path)
+    named = sorted({(file.relative_to(path).as_posix(), file) for file in files})
+    return {"poses": files_sha256(named)}
 
 
 def _by_name(file: PoseFile, source: Source, frames: Sequence[Frame], path: str) -> NDArray[np.float64]:

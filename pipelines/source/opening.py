@@ -11,7 +11,7 @@ from ...formats.datasets import Sequence
 from ...formats.errors import InputError, install_extra
 from ...formats.image_folder import list_images, read_image_times, times_file, unread_images
 from ...formats.images import is_depth_map
-from ...formats.reading import file_sha256, files_sha256, opened, reaching, require_file
+from ...formats.reading import files_sha256, known_sha256, opened, reaching, require_file
 from ...formats.textfile import read_text
 from ...formats.video import VideoFrame, VideoReader, probe_video
 from ...formats.video_head import main_track
@@ -183,19 +183,22 @@ def require_source(path: Path) -> None:
 def source_digest(source: Path, format: str) -> str:
     """Identity of a source: a video's bytes; names and bytes of the images of a folder or data set, and their times.
 
-    Other files in the folder do not count. Raises InputError where there is nothing to read.
+    Other files in the folder do not count. A file that stays the same is read once in a process. Raises InputError
+    where there is nothing to read.
     """
     require_source(source)
     recording = open_recording(source, format)
     if recording is not None and recording.image_paths:
         head = f"{recording.format} {recording.camera}".encode()
         head += b"" if recording.timestamps is None else recording.timestamps.tobytes()
-        return files_sha256(zip(recording.names, recording.image_paths, strict=True), head)
+        return files_sha256(zip(recording.names, recording.image_paths, strict=True), head, known_sha256)
     if source.is_file():
         files = video_files(source)
-        return file_sha256(source) if files == (source,) else files_sha256((str(i), f) for i, f in enumerate(files))
+        if files == (source,):
+            return known_sha256(source)
+        return files_sha256(((str(i), f) for i, f in enumerate(files)), of_file=known_sha256)
     images, times = list_images(source), times_file(source)
-    return files_sha256(sorted((p.name, p) for p in [*images, *([times] if times else [])]))
+    return files_sha256(sorted((p.name, p) for p in [*images, *([times] if times else [])]), of_file=known_sha256)
 
 
 def require_different(videos: Iterable[Path]) -> None:

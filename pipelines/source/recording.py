@@ -4,7 +4,6 @@ all that their headers say; names of frames, and files that can serve as them un
 from __future__ import annotations
 
 import itertools
-import unicodedata
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -18,6 +17,7 @@ from ...formats.datasets import Camera, Sequence, open_sequence, recognise_sourc
 from ...formats.errors import InputError
 from ...formats.exif import QUARTER_TURNS, ExifLens
 from ...formats.images import UNUSABLE, Header, Reading, is_plain, read_deep, read_header, read_rgb, read_transparent
+from ...formats.reading import LONGEST_NAME, is_plain_name
 from ...formats.video import VideoFrame
 
 _ALIKE = 1.05
@@ -33,9 +33,6 @@ Size = tuple[int, int]
 _Key = Callable[[ExifLens], float | None]
 
 WRITTEN_SUFFIXES = (".jpg", ".jpeg", ".png")
-_LONGEST_NAME = 255
-_NOT_IN_NAMES = frozenset({"Cc", "Cs", "Zl", "Zp"})
-"""Unicode's control characters, halves of pairs (so Python shows bytes that are no UTF-8), and line breaks."""
 
 Warn = Callable[[str], None]
 
@@ -188,12 +185,13 @@ def written_names(names: Iterable[str], root: Path) -> tuple[str, ...]:
     written: dict[str, str] = {}
     for name in names:
         frame = written_name(name)
-        if any(unicodedata.category(c) in _NOT_IN_NAMES for c in frame):
+        if len(frame.encode("utf-8", "surrogatepass")) > LONGEST_NAME:
+            raise InputError(f"{root}: the name {name!r} is longer than {LONGEST_NAME} bytes: rename the image")
+        if not is_plain_name(frame):
             raise InputError(
-                f"{root}: the name {name!r} holds a line break, a control character or no UTF-8: rename it"
+                f"{root}: the name {name!r} holds a line break, a control character, a slash, a drive or no UTF-8: "
+                "rename it"
             )
-        if len(frame.encode("utf-8")) > _LONGEST_NAME:
-            raise InputError(f"{root}: the name {name!r} is longer than {_LONGEST_NAME} bytes: rename the image")
         if frame in written:
             raise InputError(f"{root}: {written[frame]!r} and {name!r} would both become {frame!r}: rename one of them")
         written[frame] = name

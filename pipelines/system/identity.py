@@ -1,8 +1,9 @@
 """Which code a stage's result was made by: something that cannot be forgotten when the code changes.
 
 The identity is part of a stage's fingerprint. It is a digest of the stage's own sources: its module and all that it
-imports in this project, directly or not, but for `PLUMBING`, which says how a stage is run and not what it computes. A
-comment counts as a change too: a stage run once too often does no harm.
+imports in this project, directly or not, but for `PLUMBING`, which says how a stage is run and not what it computes,
+and the data beside these modules (weights, tables, pages). A comment counts as a change too: a stage run once too often
+does no harm.
 
 Libraries are not part of it: another numpy or COLMAP may give other bytes, and does not make a run out of date.
 """
@@ -48,9 +49,13 @@ def stage_identity(file: Path) -> str:
 
 
 def source_digest(file: Path, root: Path = ROOT) -> str:
-    """Over the names and contents of `stage_sources`; line ends do not count, as git may change them."""
+    """Over the names and contents of `stage_sources` and `data_beside` them; line ends do not count, as git may change
+    them."""
     digest = hashlib.sha256()
-    named = {os.path.relpath(path, root).replace(os.sep, "/"): path for path in stage_sources(file, root)}
+    sources = stage_sources(file, root)
+    rooms = {source.parent for source in sources if source.is_relative_to(root.resolve())}
+    files = sources | {data for room in rooms for data in data_beside(room)}
+    named = {os.path.relpath(path, root).replace(os.sep, "/"): path for path in files}
     for name, path in sorted(named.items()):
         content = path.read_bytes().replace(b"\r\n", b"\n")
         digest.update(f"{name}\0{hashlib.sha256(content).hexdigest()}\n".encode())
@@ -67,6 +72,20 @@ def stage_sources(file: Path, root: Path = ROOT) -> set[Path]:
             found.add(path)
             waiting += _imported_files(path, root)
     return found
+
+
+@functools.cache
+def data_beside(folder: Path) -> tuple[Path, ...]:
+    """Files of the package data in a room, which its modules read: all that is no Python, but in packages inside."""
+    found: list[Path] = []
+    for path in sorted(folder.iterdir()):
+        if path.name.startswith((".", "__")) or path.suffix == ".py":
+            continue
+        if path.is_file():
+            found.append(path)
+        elif path.is_dir() and not (path / "__init__.py").exists():
+            found += data_beside(path)
+    return tuple(found)
 
 
 @functools.cache

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import numba
 
+from ...formats.reading import user_cache
 from .identity import source_digest
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -39,17 +40,16 @@ def cache_root() -> Path | None:
     """Return the folder of compiled kernels: the first writable of NUMBA_CACHE_DIR, the user's cache folder and a
     private folder in the system's temporary one; None, with a warning, if there is no such place."""
     given = os.environ.get("NUMBA_CACHE_DIR")
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "msgs-slam"
-    first = (Path(given) if given else home) / "kernels"
-    if _is_private(first):
+    cache = user_cache()
+    first = Path(given) / "kernels" if given else None if cache is None else cache / "msgs-slam" / "kernels"
+    if first is not None and _is_private(first):
         return first
     second = Path(tempfile.gettempdir()) / f"msgs-slam-{os.getuid() if hasattr(os, 'getuid') else 'user'}-kernels"
+    tried = "a home folder, which this user lacks" if first is None else str(first.parent)
     if _is_private(second):
-        warnings.warn(f"cannot write to {first.parent}: compiled kernels are kept in {second}", stacklevel=3)
+        warnings.warn(f"cannot write to {tried}: compiled kernels are kept in {second}", stacklevel=3)
         return second
-    warnings.warn(
-        f"cannot write to {first.parent} nor {second.parent}: kernels are compiled at every start", stacklevel=3
-    )
+    warnings.warn(f"cannot write to {tried} nor {second.parent}: kernels are compiled at every start", stacklevel=3)
     return None
 
 

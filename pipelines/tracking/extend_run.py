@@ -84,7 +84,7 @@ def add_videos(run: RunFolder, videos: Sequence[Path], config: Config) -> Source
     files = [file.resolve() for file in video_files(Path(load_source(run).path))]
     earlier = sorted(run.root.glob(f"{EXTENSION}*"))
     numbers = [int(n) for p in earlier if (n := p.name.removeprefix(EXTENSION)).isdigit()]
-    folder = run.root / f"{EXTENSION}{max(numbers, default=0) + 1}"
+    folder = run.path(f"{EXTENSION}{max(numbers, default=0) + 1}")
     save_parent(run, folder)
     path = folder / SOURCE_LIST
     write_text(path, "".join(f"{file}\n" for file in [*files, *(v.resolve() for v in videos)]))
@@ -102,7 +102,7 @@ def _require_plain_videos(run: RunFolder, source: Path, config: Config) -> None:
     why = "with --poses" if config.frames.poses else f"from {source}, no video"
     raise InputError(
         f"{run.root} was made {why}: only runs of videos without given poses are extended. Reconstruct all of it into "
-        f"another folder, with --poses {quoted(run.root / 'export' / 'sparse' / '0')}"
+        f"another folder, with --poses {quoted(run.path('export', 'sparse', '0'))}"
     )
 
 

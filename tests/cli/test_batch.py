@@ -1,5 +1,6 @@
 """`msgs-slam batch`: many recordings, one table; `msgs-slam work`: the run of many processes is that of one."""
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -17,12 +18,13 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.reading import file_sha256
 from msgs_slam.msgs_cli.main import main
+from msgs_slam.msgs_cli.options import chosen_config, option_words
 from msgs_slam.pipelines import batch
 from msgs_slam.pipelines.batch import DONE, ELSEWHERE, FAILED, Recording, find_recordings, reconstruct_one
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.placement import Command, CommandResult
 from msgs_slam.pipelines.engine.tasks import Shard
-from msgs_slam.pipelines.read_config import load_config, merge_settings
+from msgs_slam.pipelines.read_config import load_config, merge_settings, with_absolute_paths
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings
 from msgs_slam.pipelines.run.lock import locked
 from msgs_slam.pipelines.system.progress import SilentProgress
@@ -167,6 +169,35 @@ def test_damaged_recordings_are_listed_with_the_reason(recordings: Path, tmp_pat
     assert all(str(folder / name) in text for name, text in errors.items())
     assert "git-LFS" in errors["pointer"]
     assert ".dng files are not supported" in errors["raw"]
+
+
+def test_files_of_options_are_found_from_the_folder_of_any_node(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("masks", "maps", "labels"):
+        (tmp_path / name).mkdir()
+    for name in ("cam.json", "t.gpx", "poses.txt"):
+        (tmp_path / name).write_text("")
+    (tmp_path / "all.toml").write_text('[frames]\nposes = "poses.txt"\n')
+    given = {"frames__masks": "masks", "frames__intrinsics": "cam.json#left", "export__gps": "t.gpx"}
+    given |= {"proxy__depth": "files:maps", "run__device": "cpu", "run__quality": None, "proxy__semantics": None}
+    overrides = ["proxy.semantics=files:labels", "frames.rate=3"]
+    config = chosen_config(Path("all.toml"), overrides, given)
+    words = option_words(given, overrides, config)
+    (tmp_path / "node").mkdir()
+    monkeypatch.chdir(tmp_path / "node")
+    there = CliRunner().invoke(main, ["batch", ".", "--out", "runs", *words, "--config", "../all.toml"])
+    assert "holds no video" in there.output
+    sets = [word.removeprefix("--set=") for word in words if word.startswith("--set=")]
+    rest = [word for word in words if not word.startswith("--set=")]
+    assert rest == ["--device=cpu"]
+    assert load_config(tmp_path / "all.toml", [*sets, "run.device=cpu"]) == with_absolute_paths_of(config, tmp_path)
+
+
+def with_absolute_paths_of(config: Config, folder: Path) -> Config:
+    with contextlib.chdir(folder):
+        return with_absolute_paths(config)
 
 
 def test_two_shards_write_the_table_at_the_same_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ from click.testing import CliRunner, Result
 from PIL import Image
 
 from msgs_slam.formats.atomic import temporary_of
+from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.msgs_cli.main import KindOfFile, main
 from msgs_slam.pipelines.config import EXPORTS, Config
@@ -345,3 +346,18 @@ def test_what_computes_nothing_loads_nothing_that_computes(finished_run: Finishe
     assert set(codes[: len(fine)]) == {"0"}
     assert set(codes[len(fine) :]) <= {"1", "2"}
     assert set(loaded) == {"nothing"}, done.stdout
+
+
+def test_commands_that_look_at_a_run_keep_to_its_threads(
+    finished_run: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def asked(threads: int) -> None:
+        raise InputError(f"{threads} threads")
+
+    monkeypatch.setattr("msgs_slam.pipelines.engine.tasks.set_threads", asked)
+    run = finished_run.folder
+    for words in (
+        ("export", run, "--to", tmp_path / "out"), ("render", run, tmp_path / "film.avi"), ("report", run),
+        ("evaluate", run, "--truth", finished_run.truth), ("view", run),
+    ):  # fmt: skip
+        assert "1 threads" in invoke(*words).stderr, words

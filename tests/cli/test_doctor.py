@@ -15,7 +15,7 @@ from msgs_slam.formats.errors import install_command, install_extra
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines import doctor
 from msgs_slam.pipelines.doctor import BAD, GOOD, NOTE, Finding, examine
-from msgs_slam.pipelines.system import device
+from msgs_slam.pipelines.system import device, memory
 
 
 def found(name: str, folder: Path) -> Finding:
@@ -47,6 +47,12 @@ def test_what_is_missing_is_said_with_its_fix(tmp_path: Path, monkeypatch: pytes
     assert findings["threads"].state == NOTE
     assert findings["disk"].state == BAD
     assert "0.1 GB" in findings["disk"].text
+
+
+def test_memory_is_that_of_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "memory_limits", lambda: [2e9])
+    assert found("memory", tmp_path).state == NOTE
+    assert found("memory", tmp_path).text.startswith("2.0 GB")
 
 
 @pytest.mark.parametrize(("has_pip", "words"), [(True, "-m pip install"), (False, "uv pip install --python")])

@@ -17,6 +17,16 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
+def test_a_user_without_a_home_is_told_what_to_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MSGS_SLAM_CACHE", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as for an unknown user without HOME
+    said = CliRunner().invoke(main, ["models", "list"])
+    assert said.exit_code == 1
+    assert "set MSGS_SLAM_CACHE" in said.output
+    assert isinstance(said.exception, SystemExit)
+
+
 def models(*arguments: object) -> Result:
     return CliRunner().invoke(main, ["models", *map(str, arguments)])
 

@@ -12,9 +12,14 @@ from cli_runs import QUICK, FinishedRun, files_below, invoke
 
 from msgs_slam.pipelines.engine import staleness
 from msgs_slam.pipelines.networks.registry import ModelStore
+from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_source
-from msgs_slam.pipelines.run.manifest import Manifest, write_manifest
+from msgs_slam.pipelines.run.lock import locked
+from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
+from msgs_slam.pipelines.source.opening import source_digest
+from msgs_slam.pipelines.viewer.scene import load_scenes
 from tests.cli.test_models_commands import write_network
+from tests.pipelines.finished import note_finished
 
 
 @pytest.fixture
@@ -131,6 +136,60 @@ def test_status_says_what_another_version_would_make_again(
     resumed = invoke("resume", run, "--until", "global_ba", "-v")
     assert "global_ba and what follows are made again (another version of the program" in resumed.stderr
     assert resumed.stderr.count("] up to date") == 4
+
+
+def test_what_was_made_before_a_change_stays_and_counts_again(
+    copied_run: Callable[[str], Path], tmp_path: Path
+) -> None:
+    run = copied_run("run.msgs")
+    before = contents(run)
+    other = ("--set", "mapping.hold_out=4", "--set", "mapping.min_iterations=21", "--until", "mapping")
+    assert invoke("resume", run, *other, "-q").exit_code == 0
+    assert {k for k, v in before.items() if contents(run).get(k) != v and "/mapping/" not in k} == {
+        str(run / "manifest.json"), str(run / "run.toml")
+    }  # fmt: skip
+    rows = json.loads(invoke("status", run, "--json").stdout)["stages"]
+    assert [row["state"] for row in rows] == ["done"] * 4 + ["outdated"] * 2
+    assert f"what is in {run / 'global_ba'} was made before" in " ".join(invoke("status", run).stdout.split())
+    assert (load_outcome(RunFolder(run)).map_stage, load_scenes(run)[0].mesh_file) == ("mapping", None)
+    assert invoke("report", run, "-q").exit_code == 0
+    assert "map.html" not in (run / "report.html").read_text()
+    (run / "report.html").unlink()
+    # The new map's files beside the old map's would not be told apart.
+    refused = " ".join(invoke("export", run, "--only", "ply").stderr.split())
+    assert "or write to another folder with --to DIR: other files would be mixed with these" in refused
+    assert invoke("export", run, "--only", "tum", "--to", tmp_path / "out", "-q").exit_code == 0
+    back = refused.split("go back with `")[1].split("`")[0]
+    gone_back = invoke(*shlex.split(back)[1:], "-v")
+    assert gone_back.exit_code == 0, gone_back.output
+    assert gone_back.stderr.count("] up to date") == 5
+    assert {k for k, v in before.items() if contents(run).get(k) != v} == {str(run / "manifest.json")}
+
+
+def test_an_export_waits_for_who_works_on_the_run(copied_run: Callable[[str], Path], tmp_path: Path) -> None:
+    """The stage would replace the folder, with what is being written to it."""
+    run = copied_run("run.msgs")
+    before = contents(run)
+    with locked(RunFolder(run)):
+        refused = invoke("export", run, "--only", "tum")
+        assert refused.exit_code == 1
+        assert "another msgs-slam process is working on this run" in " ".join(refused.stderr.split())
+        assert contents(run) == before
+        assert invoke("export", run, "--only", "tum", "--to", tmp_path / "out", "-q").exit_code == 0
+    assert invoke("export", run, "--only", "tum", "-q").exit_code == 0
+
+
+def test_another_format_is_not_called_another_source(finished_run: FinishedRun, tmp_path: Path) -> None:
+    run = RunFolder(tmp_path / "run.msgs")
+    run.stage("frames").mkdir(parents=True)
+    note_finished(run, ["frames"])
+    source = Source(str(finished_run.truth), source_digest(finished_run.truth, "auto"))
+    write_manifest(run.manifest_file, Manifest(source, load_records(run)))
+    before = contents(run.root)
+    refused = " ".join(invoke("resume", run.root, "--set", "run.format=images").stderr.split())
+    assert "run.format=images reads other images, times or cameras" in refused
+    assert "go on with --set run.format=auto" in refused
+    assert contents(run.root).items() - before.items() <= {(str(run.root / ".lock"), b"")}
 
 
 def test_a_source_that_has_moved_is_asked_for(copied_run: Callable[[str], Path], tmp_path: Path) -> None:

@@ -26,13 +26,13 @@ class Recorder:
 
     def bring(
         self, root: Path, config: Config | None = None, digest: str = "d", until: str = STAGES[-1],
-        stages: Sequence[Stage] = (), same_source: SameSource = trust_source,
+        stages: Sequence[Stage] = (), same_source: SameSource = trust_source, redo: str = "",
     ) -> list[str]:  # fmt: skip
         """Bring a run up to date; which stages ran."""
         self.ran.clear()
         root.mkdir(exist_ok=True)
         how = config or Config(), SilentProgress(), until, same_source
-        run_stages(list(stages or self.stages()), RunFolder(root), Path("video.mp4"), digest, *how)
+        run_stages(list(stages or self.stages()), RunFolder(root), Path("video.mp4"), digest, *how, redo=redo)
         return list(self.ran)
 
     def _make(self, name: str) -> Callable[[StageContext], dict[str, Any]]:

@@ -170,7 +170,7 @@ def test_files_that_a_network_disk_keeps_for_others_stop_nothing(
         patch.setattr(shutil, "rmtree", leaving)
         assert bring(tmp_path / "r", load_config(overrides=[OTHER])) == ["mapping"]
         (tmp_path / "r" / "proxy" / "folder" / "0.txt").unlink()
-        assert bring(tmp_path / "r", load_config(overrides=[OTHER])) == ["proxy", "tracking", "mapping"]
+        assert bring(tmp_path / "r", load_config(overrides=[OTHER])) == ["proxy"]
         empty(tmp_path / "r" / "proxy")
         assert not list((tmp_path / "r" / "proxy").iterdir())
     discard(tmp_path / "r" / "mapping")

@@ -10,7 +10,7 @@ import pytest
 from msgs_slam.formats.errors import DiskFullError, InputError
 from msgs_slam.pipelines.config import STAGES, Config, MappingConfig
 from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.run.folder import RunFolder, load_records
+from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_stale
 from tests.pipelines.engine.recorder import Recorder
 
 
@@ -38,12 +38,67 @@ def another_value(value: Any) -> Any:
     return value + 1 if isinstance(value, int | float) else f'"{value}x"'
 
 
-def test_until_stops_there_and_leaves_nothing_stale_behind(recorder: Recorder, tmp_path: Path) -> None:
+def contents(root: Path) -> dict[str, bytes]:
+    """Of every stage's folder."""
+    return {str(p.relative_to(root)): p.read_bytes() for p in root.glob("*/**/*") if p.is_file()}
+
+
+def test_results_of_later_stages_stay_until_their_own_are_ready(recorder: Recorder, tmp_path: Path) -> None:
+    root, other = tmp_path / "r", load_config(overrides=["frames.rate=5"])
+    recorder.bring(root)
+    before = contents(root)
+    assert recorder.bring(root, other, until="frames") == ["frames"]
+    run = RunFolder(root)
+    assert list(load_records(run)) == ["frames"]
+    assert list(load_stale(run)) == list(STAGES[1:])
+    later = {k: v for k, v in before.items() if not k.startswith("frames/")}
+    assert {k: v for k, v in contents(root).items() if not k.startswith("frames/")} == later
+    # What does not belong to these frames is not shown with them.
+    with pytest.raises(InputError, match=r"made before the run was changed.*or go back with `.* --set frames.rate="):
+        run.file("mapping", "result.txt")
+
+    recorder.fail_in = "proxy"
+    with pytest.raises(KeyboardInterrupt):
+        recorder.bring(root, other)
+    recorder.fail_in = ""
+    assert recorder.bring(root, Config()) == ["frames"], "what belongs to the frames of before counts again"
+    assert {k: v for k, v in contents(root).items() if not k.startswith("proxy.partial/")} == before
+    assert load_stale(RunFolder(root)) == {}
+    assert recorder.bring(root, other) == list(STAGES)
+    assert not {k for k, v in contents(root).items() if before.get(k) == v}
+    assert not list(root.glob("*.partial"))
+
+
+def test_a_stale_result_that_is_damaged_does_not_count_again(recorder: Recorder, tmp_path: Path) -> None:
     recorder.bring(tmp_path / "r")
-    (tmp_path / "r" / "proxy" / "result.txt").unlink()
-    assert recorder.bring(tmp_path / "r", until="proxy") == ["proxy"]
-    assert not (tmp_path / "r" / "export").exists()
-    assert recorder.bring(tmp_path / "r") == ["tracking", "mapping", "global_ba", "export"]
+    recorder.bring(tmp_path / "r", load_config(overrides=["frames.rate=5"]), until="frames")
+    (tmp_path / "r" / "mapping" / "result.txt").write_text("damaged")
+    assert recorder.bring(tmp_path / "r", Config()) == ["frames", "mapping"]
+
+
+def test_made_again_on_demand_everything_after_it_is(recorder: Recorder, tmp_path: Path) -> None:
+    """Even if it was stopped in between."""
+    recorder.bring(tmp_path / "r")
+    recorder.fail_in = "mapping"
+    with pytest.raises(KeyboardInterrupt):
+        recorder.bring(tmp_path / "r", redo="tracking")
+    assert recorder.ran == ["tracking", "mapping"]
+    recorder.fail_in = ""
+    assert recorder.bring(tmp_path / "r") == ["mapping", "global_ba", "export"]
+
+
+def test_an_unfinished_stage_with_links_in_it_is_begun_anew(recorder: Recorder, tmp_path: Path) -> None:
+    """The program makes none: it would write through somebody else's, elsewhere on the disk."""
+    recorder.fail_in = "mapping"
+    with pytest.raises(KeyboardInterrupt):
+        recorder.bring(tmp_path / "r")
+    recorder.fail_in = ""
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "0.txt").write_text("mine")
+    (tmp_path / "r" / "mapping.partial" / "folder").symlink_to(tmp_path / "mine")
+    assert recorder.bring(tmp_path / "r") == ["mapping", "global_ba", "export"]
+    assert (tmp_path / "mine" / "0.txt").read_text() == "mine"
+    assert not (tmp_path / "r" / "mapping" / "folder").is_symlink()
 
 
 def test_damaged_file_is_made_again(recorder: Recorder, tmp_path: Path) -> None:
@@ -145,7 +200,7 @@ def test_inputs_of_a_stage_are_looked_at_first_and_rerun_it_when_they_change(
     assert bring() == []
     assert checked == ["one"]
     maps.write_text("two")
-    assert bring() == list(STAGES[1:])
+    assert bring() == ["proxy"]
     assert checked == ["one", "two"]
     # What is finished stays when its inputs are gone, but nothing else can be made of them.
     maps.unlink()
@@ -165,7 +220,7 @@ def test_memory_that_divides_a_stage_otherwise_makes_it_again(recorder: Recorder
 
     assert bring(2100) == list(STAGES)
     assert bring(2900) == []
-    assert bring(900) == list(STAGES)
+    assert bring(900) == ["frames"], "what follows is kept where that comes out the same"
     assert bring(900) == []
 
 
@@ -180,8 +235,8 @@ def test_a_finished_stage_keeps_what_auto_has_chosen(recorder: Recorder, tmp_pat
     there["labels"] = "a network"
     assert bring() == []
     there["depth"] = "other files"
-    assert bring() == list(STAGES[1:])  # and then everything is chosen anew
+    assert bring() == ["proxy"]  # and then everything is chosen anew
     assert load_records(RunFolder(tmp_path / "r"))["proxy"].inputs == there
     auto.clear()
     there["labels"] = "another network"
-    assert bring() == list(STAGES[1:])
+    assert bring() == ["proxy"]

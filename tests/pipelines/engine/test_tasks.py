@@ -1,5 +1,6 @@
 """Processes share the tasks of a run over its folder: each once, whoever is killed, in any order; their threads."""
 
+import json
 import platform
 import resource
 import shutil
@@ -17,17 +18,19 @@ import cv2
 import engine_calls
 import pytest
 import torch
+from finished import note_finished
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from msgs_slam.formats import atomic
 from msgs_slam.formats.errors import InputError, RecoverableError
+from msgs_slam.pipelines import reconstruct
 from msgs_slam.pipelines.compute.threads import get_threads
 from msgs_slam.pipelines.compute.threads import set_threads as set_render_threads
 from msgs_slam.pipelines.config import STAGES, Config
 from msgs_slam.pipelines.engine import tasks
 from msgs_slam.pipelines.engine.runner import run_stages
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
-from msgs_slam.pipelines.engine.tasks import Shard, SharedWorkers, TaskBoard, boards_in, in_chunks, set_threads
+from msgs_slam.pipelines.engine.tasks import Chunk, Shard, SharedWorkers, TaskBoard, boards_in, in_chunks, set_threads
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.system.values import load_value
@@ -129,6 +132,32 @@ def test_a_new_lead_waits_for_who_is_at_a_task_and_begins_anew(folder: Path) -> 
     assert not board.do_one(Shard(), engine_calls.silent)
     shutil.rmtree(folder.parent / ".tasks", ignore_errors=True)
     assert shared(0, 2).each(engine_calls.halve, [8, 6], folder) == [4, 3]
+
+
+def test_a_task_that_would_write_elsewhere_is_refused(folder: Path, tmp_path: Path) -> None:
+    run = RunFolder(folder.parent)
+    for where in (tmp_path.parent, folder / ".." / "..", Path("/etc")):
+        task = Chunk(run, tmp_path / "video.mp4", Config(), where, folder / "known.npz", 0, 1)
+        board = TaskBoard.publish(engine_calls.halve, [task], folder, 1)
+        with pytest.raises(InputError, match="outside of the run"):
+            board.do_one(Shard(), engine_calls.silent)
+        board.retire()
+    board = TaskBoard.publish(engine_calls.halve, [4], folder, 1)
+    header = json.loads((board.folder / "ready.json").read_text())
+    (board.folder / "ready.json").write_text(json.dumps(header | {"folder": ".."}))
+    with pytest.raises(InputError, match="may lie outside"):
+        board.do_one(Shard(), engine_calls.silent)
+
+
+def test_boards_of_a_killed_leader_go_when_another_one_leads(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whichever command that is: workers would take tasks of a stage that has ended."""
+    run = RunFolder(folder.parent)
+    note_finished(run, [])
+    TaskBoard.publish(engine_calls.halve, [4], folder, 1)
+    seen = []
+    monkeypatch.setattr(reconstruct, "run_stages", lambda *_: seen.append(boards_in(run)))
+    reconstruct.resume(run, SilentProgress())
+    assert seen == [[]]
 
 
 def test_a_node_with_another_version_says_so_and_leaves_the_task(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 from PIL import ExifTags, Image
 
+from msgs_slam.formats import reading
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_grey_png, write_rgb
 from msgs_slam.formats.video_writer import write_video
@@ -43,6 +44,21 @@ def video(tmp_path: Path) -> Path:
         writer.write(_shade(10 * i))
     writer.release()
     return path
+
+
+def test_a_source_that_stays_the_same_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Films are gigabytes, and several steps ask whether it is still the same."""
+    monkeypatch.setattr(reading, "_JUST_WRITTEN", -1.0)
+    read, right = [], reading.file_sha256
+    monkeypatch.setattr(reading, "file_sha256", lambda path: read.append(path.name) or right(path))
+    for name in ("0.png", "1.png"):
+        write_rgb(tmp_path / name, np.zeros((24, 32, 3), np.uint8))
+    before = source_digest(tmp_path, "auto")
+    assert source_digest(tmp_path, "auto") == before
+    assert read == ["0.png", "1.png"]
+    write_rgb(tmp_path / "1.png", np.ones((24, 32, 3), np.uint8))
+    assert source_digest(tmp_path, "auto") != before
+    assert read == ["0.png", "1.png", "1.png"]
 
 
 def test_a_video_is_read_in_order_with_times(video: Path) -> None:

@@ -53,6 +53,11 @@ def test_changed_files_are_seen(source: Path) -> None:
     assert len({before["labels"], changed["labels"], proxy_inputs(source, config)["labels"]}) == 2
 
 
+def test_whether_people_are_looked_for_is_seen(source: Path) -> None:
+    asked = load_config(overrides=["frames.people=keep"])
+    assert proxy_inputs(source, asked) != proxy_inputs(source, Config())
+
+
 def test_a_pulled_or_changed_model_is_seen_under_auto(source: Path, tmp_path: Path) -> None:
     before = proxy_inputs(source, settings("auto"))
     assert before == {"depth": "multiview", "labels": "segments"}

@@ -10,7 +10,7 @@ import pytest
 from finished import note_finished
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.tensors import load_arrays
+from msgs_slam.formats.tensors import MOST_PACKED, load_arrays, save_arrays
 from msgs_slam.formats.textfile import MAX_JSON_BYTES, read_json
 from msgs_slam.pipelines.config import Config, ExportConfig
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings
@@ -20,7 +20,7 @@ from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 
 
 def test_a_large_manifest_is_read_again(tmp_path: Path) -> None:
-    files = {f"correspondence/{n:04000d}.npz": (n, f"{n:064x}") for n in range(8500)}
+    files = {f"correspondence/{n:0240d}.npz": (n, f"{n:064x}") for n in range(100_000)}
     run = RunFolder(tmp_path)
     write_manifest(
         run.manifest_file, Manifest(Source("v", "d"), {"frames": StageRecord("f", files, 1, 1, {}, [], "c")})
@@ -49,6 +49,19 @@ def test_a_large_task_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("msgs_slam.formats.tensors.MAX_UNPACKED_BYTES", 10_000)
     save_value(tmp_path / "task.npz", {"times": np.arange(5000)})
     np.testing.assert_array_equal(load_value(tmp_path / "task.npz")["times"], np.arange(5000))
+
+
+def test_what_is_packed_beyond_measure_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run may be anybody's: a few kilobytes of it must not take all memory."""
+    monkeypatch.setattr("msgs_slam.formats.tensors.MAX_UNPACKED_BYTES", 10_000)
+    save_arrays(tmp_path / "zeros.npz", {"a": np.zeros(2_000_000, np.uint8)})
+    assert (tmp_path / "zeros.npz").stat().st_size * MOST_PACKED < 2_000_000
+    with pytest.raises(InputError, match="would unpack"):
+        load_arrays(tmp_path / "zeros.npz", own=True)
+    monkeypatch.setattr("msgs_slam.pipelines.run.manifest.MAX_OWN_JSON_BYTES", 1000)
+    (tmp_path / "manifest.json").write_text("[" + " " * 1000 + "]")
+    with pytest.raises(InputError, match="larger than expected"):
+        load_records(RunFolder(tmp_path))
 
 
 @pytest.fixture

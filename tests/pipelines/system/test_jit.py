@@ -56,6 +56,14 @@ def test_a_home_that_cannot_be_written_is_said_once(monkeypatch, tmp_path):
     assert found[0].stat().st_mode & 0o777 == 0o700
 
 
+def test_a_user_without_a_home_is_told_where_kernels_are(monkeypatch, tmp_path):
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as for an unknown user without HOME
+    monkeypatch.chdir(tmp_path)
+    with pytest.warns(UserWarning, match="a home folder, which this user lacks: compiled kernels are kept in"):
+        assert jit.cache_root().parent == tmp_path / "tmp"
+    assert [p.name for p in tmp_path.iterdir()] == ["tmp"]
+
+
 def test_no_place_at_all_is_said(monkeypatch, tmp_path):
     unwritable(monkeypatch, tmp_path, "HOME")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "file" / "tmp"))
@@ -79,6 +87,9 @@ def test_a_kernel_follows_what_other_files_put_into_it(tmp_path):
     (room / "system").mkdir(parents=True)
     for name in ("__init__", "jit", "identity"):
         shutil.copyfile(ROOT / "pipelines" / "system" / f"{name}.py", room / "system" / f"{name}.py")
+    for name in ("__init__", "errors", "reading"):
+        (room.parent / "formats").mkdir(exist_ok=True)
+        shutil.copyfile(ROOT / "formats" / f"{name}.py", room.parent / "formats" / f"{name}.py")
     (room.parent / "__init__.py").write_text("")
     (room / "__init__.py").write_text("")
     (room / "kernel.py").write_text(
