@@ -296,7 +296,7 @@ def _export_section(outcome: Outcome) -> str:
     if "export" not in outcome.records:
         return section("Files for other programs", "<p>Not exported yet.</p>")
     files = [row for row in files_of_export(outcome.run) if Path(row[0]).parts[0] not in (IMAGES, "masks")]
-    written = outcome.run.stage("export") / "README.txt"
+    written = outcome.run.path("export", "README.txt")
     notes = f"<pre>{escape(read_text(written))}</pre>" if written.is_file() else ""
     return section("Files for other programs", notes, table(("in export/", "size"), files))
 
