@@ -50,12 +50,18 @@ def settled_origin(context: StageContext, origin: str, camera: pycolmap.Camera, 
 
 
 def warn_of_focal(
-    context: StageContext, origin: str, camera: pycolmap.Camera, structure: Structure, straight: pycolmap.Reconstruction
+    context: StageContext,
+    origin: str,
+    camera: pycolmap.Camera,
+    structure: Structure,
+    straight: pycolmap.Reconstruction,
+    has_times: bool,
 ) -> str:
     """Warn of a focal length that changes or that the images contradict; return the camera's final origin, of which
     EXIF is none whose focal length the adjustment has left far behind.
 
-    `camera` is the prior; `straight` the structure's model with what it would observe without a rolling shutter.
+    `camera` is the prior; `straight` the structure's model with what it would observe without a rolling shutter,
+    which was looked for only where the images of the source have times.
     """
     if structure.mapper == GIVEN_ALONE:
         return origin
@@ -67,6 +73,11 @@ def warn_of_focal(
         context.warn(
             f"the focal length seems to change: halves of the recording disagree, {first:.0f} px against {last:.0f} px "
             f"by {deviations:.0f} standard deviations. Record without zoom, or split the recording where it zooms"
+            + (
+                ""
+                if has_times
+                else "; if the images are from a video, give the video: a rolling shutter looks the same"
+            )
         )
     elif origin == "given" and all(abs(f - known) > max(_APART * sd, _OFF * known) for f, sd in halves):
         context.warn(

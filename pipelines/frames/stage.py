@@ -88,7 +88,7 @@ def run(context: StageContext) -> dict[str, Any]:
     if len(rig) == 1:
         times = np.array([frames[k].timestamp for k in keyframes])
         straight = straight_copy(structure.model, [f.xy for f in structure.features], times, structure.readout)
-        origin = warn_of_focal(context, origin, camera, structure, straight)
+        origin = warn_of_focal(context, origin, camera, structure, straight, source.has_times)
         evenly = keyframes[:: -(-len(keyframes) // _NOISE_IMAGES)]
         noise = warn_of_defects(context, [grey_of(context, masks, frames[k])[0] for k in evenly], straight)
         if structure.focal_sd:

@@ -120,7 +120,7 @@ def told_of(made: MadeViews, prior: pycolmap.Camera, origin: str, folder: Path) 
     assert found is not None
     said: list[str] = []
     around, structure = SimpleNamespace(warn=said.append), SimpleNamespace(**vars(found))
-    return warn_of_focal(around, origin, prior, structure, found.model), said  # type: ignore[arg-type]
+    return warn_of_focal(around, origin, prior, structure, found.model, has_times=False), said  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("last", [520.0, 580.0])
@@ -132,6 +132,7 @@ def test_a_zoom_is_noticed_and_a_walk_without_one_is_not_called_so(last: float, 
     assert ["the focal length seems to change: " in w and "52" in w and "58" in w for w in said] == [True] * (
         last > 520
     )
+    assert all("give the video" in w for w in said)
 
 
 @pytest.mark.parametrize("origin", ["exif", "given"])
