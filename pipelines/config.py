@@ -248,7 +248,6 @@ class ProxyConfig:
     )
     stereo_planes: int = setting(128, "multiview tries this many depths", within=(4, 1024), draft=64)
     moving: str = setting("auto", "auto leaves out what moved, by depth and poses; keep maps it", ("auto", "keep"))
-    max_classes: int = setting(16, "segments and clusters make at most this many classes", within=(1, 254))
 
 
 @dataclass(frozen=True)
@@ -302,7 +301,6 @@ class GlobalBaConfig:
     """Loops and the global adjustment."""
 
     use_loops: bool = setting(True, "look for places that are seen again")
-    use_semantics: bool = setting(True, "propose loops by semantics too, eqs. (21) to (24)")
     joint: str = setting("moved", "refine map and poses together", ("moved", "always", "never"))
     posed: str = setting(
         "every", "every: the images of the source between the picked frames get a pose too; picked: those frames alone",

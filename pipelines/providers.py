@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from .geometry.sparse_model import SparseModel
 from .types import VOID, Calibration, ClassTable, Frame, Intrinsics, require_shape
 
+MAX_CLASSES = 16
+"""Segments and clusters make at most this many classes."""
+
 
 @dataclass(frozen=True)
 class DepthEstimate:

@@ -24,6 +24,22 @@ class Facts:
     every_image: bool = True
 
 
+def _every_image(facts: Facts) -> bool:
+    return facts.every_image
+
+
+def _picked_images(facts: Facts) -> bool:
+    return not facts.every_image
+
+
+def _textured(facts: Facts) -> bool:
+    return facts.textured
+
+
+def _plain(facts: Facts) -> bool:
+    return not facts.textured
+
+
 @dataclass(frozen=True)
 class Entry:
     """A line of the README: a name for the files, what they are, which of the `EXPORTS` writes them ("" = the notes of
@@ -82,9 +98,9 @@ _ENTRIES = (
     ),
     Entry(
         "trajectory.txt", f"a pose for every image of the source, those between the frames of images/ too, {_TUM}",
-        "tum", when=lambda facts: facts.every_image,
+        "tum", when=_every_image,
     ),
-    Entry("trajectory.txt", f"a pose for every frame, {_TUM}", "tum", when=lambda facts: not facts.every_image),
+    Entry("trajectory.txt", f"a pose for every frame, {_TUM}", "tum", when=_picked_images),
     Entry(
         "point_cloud.ply",
         "the map: Gaussians in the layout of the original 3D Gaussian splatting; after it class_id, and "
@@ -110,13 +126,13 @@ _ENTRIES = (
         "mesh.glb",
         "the surface with a tenth of those vertices (labels: attribute _LABEL), and a texture made from the "
         "keyframes, exposure removed; unlit. Blender, game engines, the web.",
-        "mesh", when=lambda facts: facts.textured,
+        "mesh", when=_textured,
     ),
     Entry(
         "mesh.glb",
         "the same for glTF: a colour and a label (attribute _LABEL) at each vertex; unlit. Blender, game engines, the "
         "web.",
-        "mesh", when=lambda facts: not facts.textured,
+        "mesh", when=_plain,
     ),
     Entry(
         "mesh.obj, .mtl, .png", "the mesh with the texture as OBJ, a group for each class.", "obj",

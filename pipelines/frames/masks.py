@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...formats.datasets import recognise_source
 from ...formats.errors import InputError
 from ...formats.image_folder import frame_number, natural_key
 from ...formats.images import image_size, read_rgb, to_grey
@@ -43,8 +44,12 @@ _LITTLE, _LOOKED_AT = 0.05, 40
 
 def mask_inputs(source: Path, config: Config) -> dict[str, str] | None:
     """Return digests of the user's masks and of the networks for people; None without any."""
-    files, cards = masks_for(config, open_source(source, config.run.format)), _cards(config)
-    found = {"masks": files.digest()} if files.paths else {}
+    # Only data sets name masks: of others nothing is opened, which may be gone when their stage is done.
+    names_masks = config.run.format != "images" and recognise_source(source) is not None
+    files = MaskFiles({})
+    if config.frames.masks or names_masks:
+        files = masks_for(config, open_source(source, config.run.format))
+    cards, found = _cards(config), {"masks": files.digest()} if files.paths else {}
     return found | ({"people": cards.identity()} if cards else {}) or None
 
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from ..config import GlobalBaConfig
 from ..geometry.sparse_model import SparseModel
 from ..proxy.maps import mean_iou
 from ..sfm.retrieval import GlobalDescriptors, far_apart, loop_pairs
@@ -43,7 +42,6 @@ def loop_candidates(
     looks: GlobalDescriptors,
     summaries: Sequence[LabelSummary],
     refused: Collection[tuple[int, int]],
-    settings: GlobalBaConfig,
 ) -> list[tuple[int, int]]:
     """Pairs (i, j), i < j, of keyframe indices, sorted.
 
@@ -58,7 +56,7 @@ def loop_candidates(
         return apart(part) & (shared[part].toarray() < SHARED_POINTS)
 
     alike = loop_pairs(looks, unrelated, PER_KEYFRAME, MIN_ALIKE)
-    by_labels = _semantic_candidates(unrelated, looks, summaries) if settings.use_semantics else set()
+    by_labels = _semantic_candidates(unrelated, looks, summaries)
     return sorted(pair for pair in {*alike, *by_labels} if (ids[pair[0]], ids[pair[1]]) not in refused)
 
 

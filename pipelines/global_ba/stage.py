@@ -94,7 +94,7 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
     snapshot = context.snapshot / "loops.npz"
     if snapshot.exists():
         return load_value(snapshot)
-    run, settings, seed = context.run, context.config.global_ba, context.config.run.seed
+    run, seed = context.run, context.config.run.seed
     pictures = Pictures(run, context.config.frames)
     views = keyframe_views(context, model, pictures)
     ids = model.frame_ids.tolist()
@@ -105,7 +105,7 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
         seen = np.stack([learned[i] for i in ids])
         kinds.append(unit(seen - seen.mean(0)).astype(np.float32))
     refused = {pair for pair, matches in run.load(MATCHED_PAIRS).items() if matches == 0}
-    pairs = loop_candidates(model, GlobalDescriptors(tuple(kinds)), load_summaries(run, model), refused, settings)
+    pairs = loop_candidates(model, GlobalDescriptors(tuple(kinds)), load_summaries(run, model), refused)
     tracked = context.progress.track(pairs, "loops", len(pairs))
     found = find_loops(tracked, views, model.cam_from_world, run.load(CALIBRATION).intrinsics, seed)
     save_value(snapshot, found)

@@ -220,7 +220,7 @@ def _loops(
     learned = context.run.find(DESCRIPTORS) or {}
     known = all(i in learned for i in ids)
     looks: NDArray = np.stack([learned[i] for i in ids]) if known else small_looks([recording.views[i] for i in ids])
-    pairs = candidates(summaries, looks, constants_of(context.config)) if context.config.global_ba.use_semantics else []
+    pairs = candidates(summaries, looks, constants_of(context.config))
     if kept is not None:
         return len(pairs), kept
     poses = trajectory.cam_from_world[trajectory.is_keyframe]

@@ -18,7 +18,7 @@ from ..depth.scale import DepthScale
 from ..engine.stages import StageContext
 from ..geometry.camera import unproject
 from ..labels.segments import SegmentLabels
-from ..providers import DepthEstimate, DepthProvider, Sequence, resize_area
+from ..providers import MAX_CLASSES, DepthEstimate, DepthProvider, Sequence, resize_area
 from ..run.files import BACKBONE, GIVEN_POSES
 from ..run.folder import RunFolder
 from ..sfm.flow import follow
@@ -215,7 +215,7 @@ def reference_scale(
         source = open_source(context.source, context.config.run.format)
         found = distance_scale(known, source, sequence, frames, depth_of)
     else:
-        segments = SegmentLabels(sequence, config.max_classes, context.progress)
+        segments = SegmentLabels(sequence, MAX_CLASSES, context.progress)
         heights = segments.heights(frames, lambda frame: scale.in_backbone_unit(depth_of(frame)))
         if len(heights) == 0 or np.median(heights) <= 0:
             raise InputError(

@@ -16,7 +16,7 @@ from ..networks.card import Card, read_card
 from ..networks.network_pass import ResultCache, Workplace
 from ..networks.registry import ModelStore, default_cache
 from ..networks.words import with_words
-from ..providers import DepthProvider, SemanticsProvider, Sequence
+from ..providers import MAX_CLASSES, DepthProvider, SemanticsProvider, Sequence
 from ..source.opening import FolderSource
 from ..system.progress import Progress
 
@@ -163,8 +163,8 @@ def open_learned_semantics(around: ProviderContext, choice: Choice) -> FilesLabe
 
     place = _workplace(around, "network_labels")
     if choice.card.is_clustered:
-        return OnnxClusters(choice.card, place, around.config.max_classes)
-    return OnnxLabels(choice.card, place, around.config.max_classes, around.no_people)
+        return OnnxClusters(choice.card, place, MAX_CLASSES)
+    return OnnxLabels(choice.card, place, MAX_CLASSES, around.no_people)
 
 
 def open_depth_files(around: ProviderContext, folder: str) -> FilesDepth | RecordingDepth:
@@ -229,7 +229,7 @@ def _multiview(around: ProviderContext) -> MultiviewDepth:
 def _segments(around: ProviderContext) -> SegmentLabels:
     from ..labels.segments import SegmentLabels
 
-    return SegmentLabels(around.sequence, around.config.max_classes, around.progress)
+    return SegmentLabels(around.sequence, MAX_CLASSES, around.progress)
 
 
 OWN_DEPTH: dict[str, Callable[[ProviderContext], DepthProvider]] = {"multiview": _multiview}

@@ -59,6 +59,8 @@ class Target:
         entries = [entry for entry in _entries(self.folder) if belongs(entry.name)]
         if link := next((entry for entry in entries if entry.is_symlink() and entry.is_dir()), None):
             raise InputError(f"{link} is a link to a folder: name another place")
+        if other := next((entry for entry in entries if not (entry.is_file() or entry.is_dir())), None):
+            raise InputError(f"{other} is a device or a pipe, or a link to nothing: name a file that may be written")
         if self.overwrite:
             return
         fixed = {name: Written(*stamp, STAGE) for name, stamp in self.fixed.items()}

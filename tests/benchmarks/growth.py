@@ -25,7 +25,6 @@ sys.path.insert(0, str(ROOT))
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.config import GlobalBaConfig
 from msgs_slam.pipelines.depth.align import fit_fields
 from msgs_slam.pipelines.depth.see_through import contradicted
 from msgs_slam.pipelines.depth.stereo.neighbours import choose_neighbours, depth_range
@@ -132,7 +131,7 @@ def _loops_by_look(s: Synthetic) -> None:
 
 
 def _loop_candidates(s: Synthetic) -> None:
-    loop_candidates(s.model, GlobalDescriptors((s.looks,)), s.summaries, (), GlobalBaConfig())
+    loop_candidates(s.model, GlobalDescriptors((s.looks,)), s.summaries, ())
 
 
 def _bundle(s: Synthetic) -> None:

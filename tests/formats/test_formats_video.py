@@ -422,11 +422,10 @@ def test_each_codec_shows_the_pictures(codec: str, name: str, tmp_path: Path) ->
     assert 0 < max(errors) < 6
 
 
-def test_the_best_codec_is_one_that_browsers_play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert best_codec(tmp_path) == H264, "PyAV is there"
+def test_the_best_codec_is_one_that_browsers_play(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert best_codec() == H264, "PyAV is there"
     monkeypatch.setattr("msgs_slam.formats.video_writer._has_x264", lambda: False)
-    assert best_codec(tmp_path) in (VP9, MPEG4)
-    assert list(tmp_path.iterdir()) == []
+    assert best_codec() in (VP9, MPEG4)
 
 
 def test_no_picture_is_refused(tmp_path: Path) -> None:

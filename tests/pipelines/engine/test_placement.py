@@ -160,7 +160,7 @@ def test_an_address_without_a_cluster_is_told_of_at_once() -> None:
 
 def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(InputError, match=r"-m pip install 'msgs-slam\[cluster\]'"):
+    with pytest.raises(InputError, match=r"-m pip install 'ray>="):
         RayCluster()
 
 

@@ -18,7 +18,7 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.trajectory import write_tum
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome, refined_pose, trajectory_cells
 from msgs_slam.pipelines.evaluation.mesh_error import mesh_cells
-from msgs_slam.pipelines.evaluation.report import _truth_section
+from msgs_slam.pipelines.evaluation.report import truth_section
 from msgs_slam.pipelines.evaluation.truth import match_truth, true_trajectory
 from msgs_slam.pipelines.evaluation.write import evaluation_rows, evaluation_table, write_evaluation
 from msgs_slam.pipelines.geometry import se3
@@ -207,7 +207,7 @@ def test_a_truth_of_free_unit_claims_no_metres(oracle_run: OracleRun, truth: Seq
     assert rows["metres per unit"][1] == rows["mesh"][1] == "–"
     # The run's world and the true depth are metric, whatever the poses of the truth.
     assert 0.001 < result["depth"]["metric_l1"] < 0.1
-    assert "units of the truth" in _truth_section(result, RunFolder(Path("nowhere")))
+    assert "units of the truth" in truth_section(result, RunFolder(Path("nowhere")))
 
 
 def test_every_image_of_the_source_is_judged_beside_the_picked_frames(oracle_run: OracleRun, truth: Sequence) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.config import GlobalBaConfig, TrackingConfig
+from msgs_slam.pipelines.config import TrackingConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import align_points
@@ -51,7 +51,7 @@ class Walk:
         nothing = [summarise_labels(np.full((4, 4), 255, np.uint8), 3)] * len(self.features)
         vocabulary = learn_vocabulary(self.features, 0)
         looks = GlobalDescriptors((np.stack([describe(f, vocabulary) for f in self.features]),))
-        return loop_candidates(self.model, looks, nothing, refused, GlobalBaConfig())
+        return loop_candidates(self.model, looks, nothing, refused)
 
     def find(self) -> FoundLoops:
         return find_loops(self.pairs(), self.views(), self.model.cam_from_world, CAMERA, 0)

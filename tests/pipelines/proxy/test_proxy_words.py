@@ -257,7 +257,7 @@ def test_cards_and_files_that_do_not_fit_are_refused(
 
 def test_the_package_is_asked_for_where_it_is_missing(card: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tokenizers", None)
-    with pytest.raises(InputError, match=r"-m pip install 'msgs-slam\[words\]'"):
+    with pytest.raises(InputError, match=r"-m pip install 'tokenizers>="):
         Network(with_words(read_card(card), "wall"), 1, "cpu")
 
 

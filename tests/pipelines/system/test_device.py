@@ -83,7 +83,7 @@ def test_it_is_measured_there(run: RunFolder, world_sequence: Path) -> None:
 
 def test_it_is_drawn_there(run: RunFolder, tmp_path: Path) -> None:
     render_run(run, tmp_path / "pictures", path="own", fps=0.1)
-    assert len(list((tmp_path / "pictures").iterdir())) == 2
+    assert len(list((tmp_path / "pictures").glob("*.png"))) == 2
 
 
 def test_it_is_viewed_from_there(run: RunFolder) -> None:

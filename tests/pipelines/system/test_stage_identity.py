@@ -76,7 +76,7 @@ FOREIGN = {
     "proxy": {"frames.poses", "frames.people"},  # refused without; an input
     "tracking": {"frames.poses", "frames.least_piece"},  # of `extend`; an input
     "global_ba": {"frames.max_side"},  # as the frames are, whose content is upstream
-    "export": {"proxy.scale_ref"},  # of pieces, whose own stages have it
+    "export": {"proxy.scale_ref", "frames.max_side"},  # of pieces, whose own stages have it; as for global_ba
 }
 
 
