@@ -195,7 +195,8 @@ def test_a_truth_of_free_unit_claims_no_metres(oracle_run: OracleRun, truth: Seq
     poses = truth.world_from_cam.copy()
     poses[:, :3, 3] *= 0.13
     free = replace(truth, world_from_cam=poses, metric=False)
-    result = write_evaluation(oracle_run(mesh=True), free, max_views=2)
+    run = oracle_run(mesh=True)
+    result = write_evaluation(run, free, max_views=2)
     assert result["unit"] == "units of the truth"
     assert result["trajectory"]["sim3 all"]["scale"] == pytest.approx(0.13, rel=1e-6)
     for group in (result["trajectory"]["se3 all"], result["scale"], result["mesh"]):
@@ -207,7 +208,7 @@ def test_a_truth_of_free_unit_claims_no_metres(oracle_run: OracleRun, truth: Seq
     assert rows["metres per unit"][1] == rows["mesh"][1] == "–"
     # The run's world and the true depth are metric, whatever the poses of the truth.
     assert 0.001 < result["depth"]["metric_l1"] < 0.1
-    assert "units of the truth" in truth_section(result, RunFolder(Path("nowhere")))
+    assert "units of the truth" in truth_section(result, load_outcome(run))
 
 
 def test_every_image_of_the_source_is_judged_beside_the_picked_frames(oracle_run: OracleRun, truth: Sequence) -> None:
