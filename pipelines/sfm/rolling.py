@@ -306,14 +306,11 @@ def adjust_rolling(
         if readout is None:
             step, share = estimate(*seen, rolling.times, axis)
             seconds += step
-    if readout is None:
-        ev = weigh_readout(rolling, (axis[0] * seconds, axis[1] * seconds))
-        print("READOUT", seconds, longest, seconds**2 * share, ev, flush=True)
-    if readout is None and (seconds**2 * share < MIN_GAIN or abs(seconds) > longest):
-        return None
-    if readout is None and not ev.is_convincing:
-        return None
     found = axis[0] * seconds, axis[1] * seconds
+    if readout is None and (
+        seconds**2 * share < MIN_GAIN or abs(seconds) > longest or not weigh_readout(rolling, found).is_convincing
+    ):
+        return None
     rolling.rectify_observations(*seen, found)
     focal_sd = adjust(rolling.model, refine_camera, narrowly)
     rolling.put(rolling.plain)
