@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from .adjust import median_error, reprojection_errors, solve
+from .adjust import median_error, reprojection_errors, robust_cost, solve
 from .drift import MAX_DRIFT, NO_DRIFT, ScaleDrift, scale_drift
 from .lens import distortion_of
 from .matching import VerifiedPair
@@ -28,9 +28,6 @@ MIN_GAIN_OF_FREEING = 0.03
 blur, another Kinect's nominal 525 px 0.057."""
 MIN_BETTER = 0.01
 """By how much less of the matches the model of the camera found anew must leave unexplained to be taken."""
-_FARTHEST_PX = 100.0
-"""Errors count at most as much as this: of false matches nobody knows how wrong they are."""
-
 _AGREE_PX = 4.0
 _MAX_MISPLACED = 0.2
 
@@ -192,9 +189,9 @@ def gain_of_freeing(model: pycolmap.Reconstruction) -> float:
         middle = camera.principal_point_x, camera.principal_point_y
         params = [camera.mean_focal_length(), *middle, 0.0, 0.0]
         camera.model, camera.params = pycolmap.CameraModelId.RADIAL, params
-    before = _cost(reprojection_errors(model))
+    before = robust_cost(reprojection_errors(model))
     solve(freed, sorted(freed.reg_image_ids()), refine_camera=True, bend_lens=bends)
-    return 1 - _cost(reprojection_errors(freed)) / max(before, 1e-12)
+    return 1 - robust_cost(reprojection_errors(freed)) / max(before, 1e-12)
 
 
 def unexplained(
@@ -203,9 +200,4 @@ def unexplained(
     """Return the mean robust cost of the distances of all verified matches to their epipolar lines under a model's
     poses and camera, whichever of them its points are made of."""
     errors = [error for _, error in matched_errors(model, pairs, xy)]
-    return _cost(np.concatenate(errors)) if errors else float("inf")
-
-
-def _cost(errors: NDArray[np.float64]) -> float:
-    """Mean of Cauchy's loss at a pixel's width."""
-    return float(np.log1p(np.nan_to_num(errors, nan=_FARTHEST_PX).clip(max=_FARTHEST_PX) ** 2).mean())
+    return robust_cost(np.concatenate(errors)) if errors else float("inf")

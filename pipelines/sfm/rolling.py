@@ -20,7 +20,7 @@ from ...formats.errors import InputError
 from ..geometry import se3
 from ..types import Array, Intrinsics
 from . import bundle_kernels as kernels
-from .adjust import LOSS_SD, adjust, solve
+from .adjust import LOSS_SD, adjust, robust_cost, solve
 from .bundle import Bundle, Problem, adjust_bundle
 
 Readout = tuple[float, float]
@@ -42,7 +42,6 @@ change the scale of one stretch of the path against another. Seven recordings of
 1.01 to 1.05, but 1.54 where the camera hardly does more than turn."""
 _LONG_TRACK = 4
 """Views of a point from which on an observation of it may be held out."""
-_FARTHEST_PX = 100.0
 _ROUNDS = 3
 """Of readout and rough adjustment by turns; the last adjustment comes after them."""
 
@@ -244,7 +243,7 @@ def weigh_readout(rolling: RollingModel, readout: Readout) -> ReadoutEvidence:
             found = replace(found, cam_from_world=adjusted.cam_from_world, points=adjusted.points)
         velocity = velocities(found.cam_from_world, rolling.times)
         errors = rectified_bundle(found, xy, pinhole, velocity, tried).select(held).reprojection_errors(pinhole)
-        costs.append(float(np.log1p(np.minimum(np.nan_to_num(errors, nan=np.inf), _FARTHEST_PX) ** 2).mean()))
+        costs.append(robust_cost(errors))
         depths.append(np.maximum(found.points_in_cam()[:, 2], 1e-9))
     change = np.log(depths[1] / depths[0])
     by_camera = np.array([np.median(change[bundle.obs_cam == c]) for c in np.unique(bundle.obs_cam)])
@@ -269,11 +268,9 @@ def rectified_features(
     no point of the model tells."""
     if not any(readout):
         return xy
-    rolling = RollingModel(pycolmap.Reconstruction(model), xy, times)
-    rolling.rectify_observations(*rolling.bundle(), readout)
-    out = [np.full(pixels.shape, np.nan) for pixels in xy]
-    for i, features, own in zip(rolling.images, rolling.features, rolling.arrays.rows(), strict=True):
-        out[i - 1][features] = rolling.now[own]
+    seen, out = ModelArrays.of(straight_copy(model, xy, times, readout)), [np.full(p.shape, np.nan) for p in xy]
+    for i, own in zip(seen.image_ids.tolist(), seen.rows(), strict=True):
+        out[i - 1][seen.obs_feature[own]] = seen.obs_xy[own]
     return out
 
 
