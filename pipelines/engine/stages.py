@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -115,29 +114,19 @@ class Later:
     name: str = "run"
 
     @property
-    def _whole(self) -> str:
-        return f"{__name__.rpartition('.engine.')[0]}.{self.module}"
-
-    @property
     def function(self) -> Callable[..., Any]:
         """The function; imports its module."""
-        function: Callable[..., Any] = getattr(import_module(self._whole), self.name)
+        function: Callable[..., Any] = getattr(import_module(f"...{self.module}", __name__), self.name)
         return function
 
     def __call__(self, *args: Any) -> Any:
         """Call the function."""
         return self.function(*args)
 
-    @property
-    def file(self) -> Path:
-        """Path of the module."""
-        spec = find_spec(self._whole)
-        return Path(str(spec and spec.origin))
-
 
 @dataclass(frozen=True)
 class Stage:
-    """`run` does the work and returns its key figures; what code it is follows from its module (`stage_identity`).
+    """`run` does the work and returns its key figures.
 
     A stage that reads more than the stages before it says so by `inputs`: plain values that change with what it reads
     (files, models). `check` refuses what it could not use. Both see (source, config) before the first stage runs, so
@@ -153,11 +142,6 @@ class Stage:
     check: Callable[[Path, Config], None] | None = None
     auto: Callable[[Config], tuple[str, ...]] = lambda config: ()
     division: Callable[[RunFolder, Config], Any] | None = None
-
-    @property
-    def file(self) -> Path:
-        """The module of `run`."""
-        return self.run.file if isinstance(self.run, Later) else Path(self.run.__code__.co_filename)
 
 
 def stopping_after_writes(folder: Path) -> AbstractContextManager[None]:

@@ -8,7 +8,7 @@ from typing import Any
 from ..config import Config, config_to_dict
 from ..run.folder import RunFolder
 from ..run.manifest import StageRecord, differing_settings, recorded_config
-from ..system.identity import stage_identity
+from ..system.identity import package_digest
 from .stages import Stage
 
 
@@ -16,7 +16,7 @@ def stage_fingerprint(stage: Stage, config: Config, upstream: str, inputs: Any) 
     """Digest of what a stage's result depends on: its code, its settings, the seed, its inputs, what is before."""
     own = config_to_dict(getattr(config, stage.name))
     beside = [] if inputs is None else [inputs]
-    text = json.dumps([stage.name, stage_identity(stage.file), own, config.run.seed, upstream, *beside], sort_keys=True)
+    text = json.dumps([stage.name, package_digest(), own, config.run.seed, upstream, *beside], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -24,10 +24,10 @@ from ...formats.atomic import unique_temp_names
 from ...formats.errors import InputError, RecoverableError
 from ...formats.reading import resolve_own
 from ...formats.textfile import read_json, write_json
-from ..config import STAGES, Config
+from ..config import Config
 from ..run.folder import RunFolder
 from ..run.lock import take_lock
-from ..system.identity import stage_file, stage_identity
+from ..system.identity import package_digest
 from ..system.progress import Progress, stop_if_asked
 from ..system.values import load_value, name_of, of_name, save_value
 from .stages import StageContext, stopping_after_writes
@@ -297,9 +297,7 @@ def code_identity() -> str:
     """List what results depend on: the program's stages, Python, the libraries that compute; name=version of each."""
     from importlib.metadata import PackageNotFoundError, version
 
-    stages = " ".join(stage_identity(stage_file(name)) for name in STAGES)
-    program = hashlib.sha256(stages.encode()).hexdigest()
-    found = {"msgs-slam": program, "Python": platform.python_version()}
+    found = {"msgs-slam": package_digest(), "Python": platform.python_version()}
     for name in _COMPUTE:
         try:
             found[name] = version(name).partition("+")[0]  # +cpu, +cu128: the device is a setting

@@ -2,6 +2,7 @@
 
 import functools
 import os
+import re
 import stat
 import tempfile
 import warnings
@@ -13,9 +14,11 @@ from typing import Any, TypeVar
 import numba
 
 from ...formats.reading import user_cache
-from .identity import source_digest
+from .identity import digest_of
 
 F = TypeVar("F", bound=Callable[..., Any])
+_IMPORT = re.compile(r"^\s*from (\.+)([\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
+"""An import inside the project: these are relative."""
 
 
 def kernel(function: F | None = None, **options: Any) -> Any:
@@ -30,9 +33,28 @@ def kernel(function: F | None = None, **options: Any) -> Any:
     root = cache_root()
     # numba looks only at the file of the function that it compiles, and would go on using machine code into which an
     # older version of another file is inlined: the folder's name follows all files that this one imports.
-    directory = None if root is None else root / source_digest(Path(function.__code__.co_filename))
+    directory = None if root is None else root / digest_of(imported_files(Path(function.__code__.co_filename)))
     with _numba_cache_in(directory):
         return numba.njit(**{"nogil": True, "error_model": "numpy", "cache": root is not None, **options})(function)
+
+
+def imported_files(file: Path) -> set[Path]:
+    """Find the module and what it imports of this project, directly or not, without importing any of it."""
+    found, waiting = set[Path](), [file.resolve()]
+    while waiting:
+        if (path := waiting.pop()) not in found:
+            found.add(path)
+            waiting += _direct_imports(path)
+    return found
+
+
+@functools.cache
+def _direct_imports(path: Path) -> list[Path]:
+    found: list[Path] = []
+    for dots, below, names in _IMPORT.findall(path.read_text(encoding="utf-8")):
+        folder = path.parents[len(dots) - 1].joinpath(*filter(None, below.split(".")))
+        found += [folder.with_suffix(".py"), *(folder / f"{name}.py" for name in re.findall(r"\w+", names))]
+    return [file for file in found if file.is_file()]
 
 
 @functools.cache
