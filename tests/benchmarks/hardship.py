@@ -358,11 +358,9 @@ def main() -> None:
     disk = work / "disk"
     disk.mkdir(parents=True, exist_ok=True)
     os.environ["MSGS_SLAM_CACHE"] = str(work / "no_networks")
-    from msgs_slam.pipelines.reconstruct import all_stages
-    from msgs_slam.pipelines.system.identity import stage_identity
+    from msgs_slam.pipelines.system.identity import package_digest
 
-    for stage in all_stages():  # what every child would read again
-        stage_identity(stage.file)
+    package_digest()  # what every child would read again
     assert os.waitpid(in_child(lambda: prepare(work)), 0)[1] == 0
     subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "tmpfs", str(disk)], check=True)
     tried = wrong = 0

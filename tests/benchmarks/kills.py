@@ -37,9 +37,9 @@ from msgs_slam.formats.textfile import read_json_object, write_json
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.config import STAGES, Config
 from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.reconstruct import all_stages, reconstruct, resume
+from msgs_slam.pipelines.reconstruct import reconstruct, resume
 from msgs_slam.pipelines.run.folder import RunFolder, load_settings
-from msgs_slam.pipelines.system.identity import stage_identity
+from msgs_slam.pipelines.system.identity import package_digest
 from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.world import ClipOptions, iter_clip, make_world
 
@@ -124,7 +124,7 @@ def stage_at(run: RunFolder) -> str:
 
 def unbroken(clip: Path, work: Path) -> list[dict[str, str]]:
     """Digests after every round, of a run that nobody kills; kept in `work` for the next call with the same code."""
-    kept, code = work / "whole.json", [stage_identity(s.file) for s in all_stages()] + [SETTINGS, CHANGES]
+    kept, code = work / "whole.json", [package_digest(), SETTINGS, CHANGES]
     code = json.loads(json.dumps(code))
     if kept.exists() and (found := read_json_object(kept))["code"] == code:
         return found["digests"]
