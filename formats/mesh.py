@@ -1,4 +1,4 @@
-"""Labelled triangle meshes in PLY and GLB, and textured ones in OBJ and GLB."""
+"""Labelled triangle meshes in PLY and GLB, and textured ones in GLB."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .atomic import write_text
 from .errors import InputError
 from .glb import UNLIT, Part, glb_parts, linear, material, write_primitive
-from .images import decode_rgb, jpeg_bytes, write_rgb
+from .images import decode_rgb, jpeg_bytes
 from .ply import Rows, columns, read_ply, read_rows, write_ply
 from .reading import parsing, read_bytes
 from .trajectory import FARTHEST
@@ -207,29 +206,6 @@ class TexturedMesh:
         for name, indices, most in (("corner", self.faces, k), ("vertex", self.corner_vertex, v)):
             if not 0 <= indices.min() <= indices.max() < most:
                 raise ValueError(f"TexturedMesh: a {name} is outside the {most} there are")
-
-
-def write_textured_obj(path: Path, mesh: TexturedMesh, class_names: tuple[str, ...] = ()) -> list[Path]:
-    """Write the OBJ, its material and its image beside it, of the same stem; a group a class (of each face's first
-    vertex). The same mesh gives the same bytes. Raises InputError when the disk refuses.
-    """
-    path = Path(path)
-    material, picture = path.with_suffix(".mtl"), path.with_suffix(".png")
-    write_rgb(picture, mesh.texture)
-    shown = "Ka 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 0\n"  # the photographs hold the light already
-    write_text(material, f"newmtl photographs\n{shown}map_Kd {picture.name}\n")
-    names = [name.replace(" ", "_") for name in class_names]
-    lines = [f"mtllib {material.name}", "usemtl photographs"]
-    lines += ["v {:.6g} {:.6g} {:.6g}".format(*row) for row in mesh.vertices.tolist()]
-    lines += [f"vt {u:.7f} {1 - v:.7f}" for u, v in mesh.corner_uv.tolist()]
-    of_face = mesh.labels[mesh.corner_vertex[mesh.faces[:, 0]]]
-    for label in np.unique(of_face):
-        lines.append(f"g {names[label] if label < len(names) else 'unknown'}")
-        faces = mesh.faces[of_face == label]
-        pairs = np.stack([mesh.corner_vertex[faces], faces], axis=2).reshape(-1, 6) + 1
-        lines += ["f {}/{} {}/{} {}/{}".format(*row) for row in pairs.tolist()]
-    write_text(path, "\n".join(lines) + "\n")
-    return [path, material, picture]
 
 
 def write_textured_glb(path: Path, mesh: TexturedMesh, class_names: tuple[str, ...] = ()) -> None:

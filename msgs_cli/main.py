@@ -279,10 +279,10 @@ def export(
 ) -> None:
     """Export to other formats: COLMAP model, Gaussian PLY, SPZ, SOG or GLB, labelled mesh, textured mesh,
     TUM trajectory; `--only html`: one web page that shows the map, to send to somebody; `--only tiles`: 3D Tiles for
-    CesiumJS; `--only obj`: the textured mesh as OBJ; `--only collision`: a light mesh to walk in; `--only usd`: the
+    CesiumJS; `--only collision`: a light mesh to walk in; `--only usd`: the
     mesh as USDZ; `--only floorplan`: the walls from above with their lengths.
 
-    Other settings than the run's own (--set export.voxel=0.02, --set export.spz=true) need --to; `msgs-slam resume RUN
+    Other settings than the run's own (--set export.voxel=0.02) need --to; `msgs-slam resume RUN
     --set ...` changes them in the run itself.
     """
     if (config_file or overrides) and (to is None or to.resolve() == (run_path / "export").resolve()):

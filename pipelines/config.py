@@ -5,7 +5,7 @@ from typing import Any
 
 STAGES = ("frames", "proxy", "tracking", "mapping", "global_ba", "export")
 EXPORTS = (
-    "colmap", "ply", "spz", "sog", "glb", "tiles", "html", "mesh", "obj", "collision", "usd", "floorplan", "tum",
+    "colmap", "ply", "spz", "sog", "glb", "tiles", "html", "mesh", "collision", "usd", "floorplan", "tum",
 )  # fmt: skip
 GPS_OFF, GPS_AUTO = "off", "auto"
 EXTENSION = "extension_"
@@ -360,10 +360,6 @@ class ExportConfig:
             "Neither rescales coordinates. Default: auto.",
         ),
     )  # fmt: skip
-    spz: bool = setting(False, "write the map as point_cloud.spz too")
-    spz_version: int = setting(4, "version of that file; 3 for older readers", within=(3, 4))
-    splat_glb: bool = setting(False, "write the map as point_cloud.glb too (glTF, KHR_gaussian_splatting)")
-    sh_rest: bool = setting(False, "the splat PLYs hold f_rest_0 to 44 too, all zero, for readers that insist on them")
     texture: bool = setting(
         True, "mesh.glb has a texture of the keyframes; false: all vertices, with their colours", draft=False
     )

@@ -4,7 +4,7 @@ Each step is a task over chunks of keyframes or of regions, and leaves files in 
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +18,7 @@ from ...formats.mesh import (
     write_mesh_glb,
     write_mesh_ply,
     write_textured_glb,
-    write_textured_obj,
-)  # fmt: skip
+)
 from ..compute.threads import get_threads, host_threads
 from ..config import ExportConfig
 from ..engine.stages import StageContext
@@ -52,60 +51,37 @@ MAX_TEXTURED = 4_000_000
 the colours of its vertices do."""
 
 
-@dataclass(frozen=True)
-class MeshJob:
-    """Which `kinds` of the mesh ("mesh": PLY and GLB, "obj") go into a folder; a mesh.ply and mesh.glb that are there
-    to `keep` stay. The tasks are those of `context`, whose snapshot has what does not fit into memory."""
-
-    context: StageContext
-    kinds: tuple[str, ...]
-    folder: Path
-    keep: bool = False
-
-    @property
-    def scratch(self) -> Path:
-        """Folder of rendered views and finished regions."""
-        return _scratch(self.context)
-
-    @property
-    def ply(self) -> Path:
-        """Path of the mesh, which the other files are made from."""
-        return (self.folder if "mesh" in self.kinds else self.scratch) / "mesh.ply"
-
-
-def write_meshes(job: MeshJob, outcome: Outcome, world: World) -> list[Path]:
+def write_meshes(context: StageContext, folder: Path, outcome: Outcome, world: World) -> list[Path]:
     """Draw the map in the keyframes, snap uncertain depths to planes, fuse all region by region, join the regions, and
-    write what the job asks for: the mesh with all its vertices as a PLY; a lighter one with a texture as a GLB or OBJ.
+    write mesh.ply with all its vertices, and mesh.glb, lighter and with a texture where the settings want one.
 
+    The tasks are those of `context`, whose snapshot has what does not fit into memory; files in the folder stay.
     `outcome` has been moved, and may be without its map. Returns the paths written.
     """
-    settings, names, axes = job.context.config.export, outcome.classes.names, world.gltf_from_exported
-    glb, obj, count = job.folder / "mesh.glb", job.folder / "mesh.obj", len(keyframe_rows(outcome))
-    views, is_made = drawn_views(job.scratch, count), job.keep and job.ply.exists()
-    if is_made and glb.exists():
-        return [job.ply, glb]
-    in_chunks(job.context, draw_keyframes, count, move=outcome.move)
+    settings, names, axes = context.config.export, outcome.classes.names, world.gltf_from_exported
+    ply, glb, scratch, count = folder / "mesh.ply", folder / "mesh.glb", _scratch(context), len(keyframe_rows(outcome))
+    if ply.exists() and glb.exists():
+        return [ply, glb]
+    in_chunks(context, draw_keyframes, count, move=outcome.move)
     if settings.planes:
-        in_chunks(job.context, snap_views, count, planes=planes_in(job.scratch, count))
-    if not is_made:
+        in_chunks(context, snap_views, count, planes=planes_in(scratch, count))
+    views = drawn_views(scratch, count)
+    if not ply.exists():
         grid = _grid_around(views, settings)
         regions, class_ids = len(list(grid.regions())), tuple(outcome.label_of_channel.tolist())
-        in_chunks(job.context, fuse_views, regions, grid=grid, views=count, class_ids=class_ids)
+        in_chunks(context, fuse_views, regions, grid=grid, views=count, class_ids=class_ids)
         # Regions are loaded one at a time, whenever `joined` goes over them.
-        whole = joined(lambda: (load_value(_region_file(job.scratch, n)) for n in range(regions)))
-        write_mesh_ply(job.ply, whole, names)
-    mesh, paths = mesh_blocks(job.ply), [job.ply] if "mesh" in job.kinds else []
+        write_mesh_ply(ply, joined(lambda: (load_value(_region_file(scratch, n)) for n in range(regions))), names)
+    mesh = mesh_blocks(ply)
     if not mesh.face_count:
-        return paths
-    if "obj" not in job.kinds and (mesh.face_count > MAX_TEXTURED or not settings.texture):
+        return [ply]
+    if mesh.face_count > MAX_TEXTURED or not settings.texture:
         write_mesh_glb(glb, mesh, names, axes)
-        return [*paths, glb]
-    textured = make_textured(outcome, read_mesh_ply(job.ply), Shown(views), job.context.progress)
-    if "mesh" in job.kinds:
+    else:
+        textured = make_textured(outcome, read_mesh_ply(ply), Shown(views), context.progress)
         turned = replace(textured, vertices=(textured.vertices @ axes.T).astype(np.float32))
         write_textured_glb(glb, turned, names)
-        paths.append(glb)
-    return paths + (write_textured_obj(obj, textured, names) if "obj" in job.kinds else [])
+    return [ply, glb]
 
 
 def _scratch(context: StageContext) -> Path:

@@ -135,10 +135,6 @@ _ENTRIES = (
         "mesh", when=_plain,
     ),
     Entry(
-        "mesh.obj, .mtl, .png", "the mesh with the texture as OBJ, a group for each class.", "obj",
-        ("mesh.obj", "mesh.mtl", "mesh.png"),
-    ),
-    Entry(
         "collision.glb",
         "the surface to walk in, without colours: at most 20,000 triangles, and a floor without holes where one "
         "was found. Game engines, PlayCanvas.",
@@ -175,7 +171,7 @@ _MORE = "More kinds of files: msgs-slam export --help"
 
 _UPRIGHT = """\
 Axes: z is up, from the {source}; {height}.
-{heading}. So have trajectory.txt, mesh.ply and mesh.obj. Trainers and viewers of splats take y for down:
+{heading}. So have trajectory.txt and mesh.ply. Trainers and viewers of splats take y for down:
 sparse/0, transforms.json and point_cloud*.ply and .sog are turned to x right, y down, z forward, (x, y, z) to
 (x, -z, y). In GLB, SPZ and USD files y is up, as these formats define it.
 """

@@ -31,7 +31,7 @@ from .extra.meshes import write_collision, write_usd
 from .extra.tiles import write_tiles
 from .extra.web_page import write_web_page
 from .images import IMAGES
-from .mesh import MeshJob, mesh_figures, write_meshes
+from .mesh import mesh_figures, write_meshes
 from .pieces import write_pieces
 from .readme import names_of
 from .writers import (
@@ -70,7 +70,7 @@ def run(context: StageContext) -> dict[str, Any]:
     # The mesh, by tasks that load the map themselves
     outcome = replace(outcome, gaussian_map=None)
     release_free_memory()
-    write_meshes(MeshJob(context, ("mesh",), folder, keep=True), outcome, world)
+    write_meshes(context, folder, outcome, world)
     write_readme(outcome, world, folder, files_in(folder))
     mesh = mesh_blocks(folder / "mesh.ply")
     if mesh.face_count == 0:
@@ -128,10 +128,9 @@ def find_world(outcome: Outcome, settings: ExportConfig) -> tuple[World, list[st
     return world, [*reasons, reason] if reason else reasons
 
 
-def kinds_of_run(outcome: Outcome, settings: ExportConfig) -> list[str]:
-    """The `EXPORTS` that a finished run has: SPZ and GLB where the settings want them, tiles of a map in parts."""
-    asked = {"spz": settings.spz, "glb": settings.splat_glb, "tiles": bool(outcome.run.load(SUBMAPS))}
-    return ["html", "colmap", "ply", *(kind for kind, is_wanted in asked.items() if is_wanted), "tum", "mesh"]
+def kinds_of_run(outcome: Outcome) -> list[str]:
+    """The `EXPORTS` that a finished run has: tiles of a map in parts."""
+    return ["html", "colmap", "ply", *["tiles"] * bool(outcome.run.load(SUBMAPS)), "tum", "mesh"]
 
 
 def write_all_but_mesh(
@@ -139,7 +138,7 @@ def write_all_but_mesh(
 ) -> list[Path]:
     """Write the `kinds_of_run` into a folder, but for the mesh and README.txt. `outcome` stands in `world`."""
     writers = _writers(outcome, world, settings, folder, warn)
-    paths = [path for kind in kinds_of_run(outcome, settings) if kind != "mesh" for path in writers[kind]()]
+    paths = [path for kind in kinds_of_run(outcome) if kind != "mesh" for path in writers[kind]()]
     return paths + write_notes(outcome, world, folder)
 
 
@@ -149,8 +148,8 @@ def _writers(
     """What writes each of the `EXPORTS` but those of the mesh's own making, all from the same moved `outcome`."""
     return {
         "colmap": lambda: write_colmap(outcome, world, settings.image_side, folder, warn),
-        "ply": lambda: write_ply(outcome, world, settings.sh_rest, folder),
-        **{k: partial(write_splats, k, outcome, world, settings, folder) for k in ("spz", "sog", "glb")},
+        "ply": lambda: write_ply(outcome, world, folder),
+        **{k: partial(write_splats, k, outcome, world, folder) for k in ("spz", "sog", "glb")},
         "tiles": lambda: write_tiles(outcome, world, folder),
         "html": lambda: write_web_page(outcome, world, folder),
         "collision": lambda: write_collision(outcome, world, folder),
@@ -180,7 +179,7 @@ def export_run(
         raise InputError(f"{folder / IMAGES} is the source of {run.root}: name another folder with --to")
     with locked_export(run, folder):
         outcome, world, settings = _exported(run, settings)
-        kinds = [only] if only else kinds_of_run(outcome, settings)
+        kinds = [only] if only else kinds_of_run(outcome)
         names = names_of(kinds, with_notes=not only)
         manifest = run.manifest()
         fixed = manifest.records["export"].files if is_own and manifest and "export" in manifest.records else {}
@@ -222,7 +221,7 @@ def _write_kinds(
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             config = replace(outcome.config, export=settings)
             context = StageContext(outcome.run, Path(), config, Path(scratch), progress)
-            paths += write_meshes(MeshJob(context, (kind,), folder), outcome, world)
+            paths += write_meshes(context, folder, outcome, world)
     return paths
 
 

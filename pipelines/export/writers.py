@@ -18,7 +18,6 @@ from ...formats.sog import write_sog
 from ...formats.splats import write_gaussian_glb
 from ...formats.spz import write_spz
 from ...formats.trajectory import write_tum
-from ..config import ExportConfig
 from ..geometry.camera import rig_of
 from ..geometry.se3 import Similarity
 from ..geometry.sparse_model import FrameObservations, SparseModel
@@ -137,7 +136,7 @@ def map_sample(gaussian_map: GaussianMap, count: int) -> tuple[NDArray[np.float6
     return picked.means.cpu().numpy().astype(np.float64), colors
 
 
-def write_ply(outcome: Outcome, world: World, sh_rest: bool, folder: Path) -> list[Path]:
+def write_ply(outcome: Outcome, world: World, folder: Path) -> list[Path]:
     """The map as splat PLYs, upright in viewers of these, in its own colours and in those of the classes; part by part,
     for a cloud takes more memory than the map it is of. The probabilities are in the first only."""
     starts, names = range(0, max(len(outcome.require_map()), 1), _PART), outcome.classes.names
@@ -147,13 +146,13 @@ def write_ply(outcome: Outcome, world: World, sh_rest: bool, folder: Path) -> li
 
     clouds = LruSequence(len(starts), part, len, 0)
     paths = [folder / n for n in ("point_cloud.ply", "point_cloud_semantic.ply")]
-    write_gaussian_ply(paths[0], clouds, names, sh_degree=3 * sh_rest)
+    write_gaussian_ply(paths[0], clouds, names)
     by_class = clouds.changed(lambda _, cloud: _by_class(cloud, outcome))
-    write_gaussian_ply(paths[1], by_class, names, sh_degree=3 * sh_rest)
+    write_gaussian_ply(paths[1], by_class, names)
     return paths
 
 
-def write_splats(kind: str, outcome: Outcome, world: World, settings: ExportConfig, folder: Path) -> list[Path]:
+def write_splats(kind: str, outcome: Outcome, world: World, folder: Path) -> list[Path]:
     """Write the map's colours as point_cloud.spz, .sog or .glb, upright in viewers: SPZ defines the gravity direction,
     the others are turned as splat PLYs are.
 
@@ -162,7 +161,7 @@ def write_splats(kind: str, outcome: Outcome, world: World, settings: ExportConf
     """
     cloud, path = map_cloud(outcome), folder / f"point_cloud.{kind}"
     if kind == "spz":
-        write_spz(path, _turned(cloud, world), settings.spz_version)
+        write_spz(path, _turned(cloud, world))
     elif len(cloud) == 0:
         return []
     elif kind == "sog":

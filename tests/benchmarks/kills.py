@@ -49,7 +49,7 @@ SETTINGS = (
     "mapping.min_iterations=20", "mapping.max_gaussians=3000", "mapping.snapshot_every=5", "export.voxel=0.1",
 )  # fmt: skip
 CHANGES = (
-    (), ("export.spz=true",), ("proxy.stereo_planes=12",), ("mapping.min_iterations=24",), ("export.mesh_side=100",),
+    (), ("export.axes=first",), ("proxy.stereo_planes=12",), ("mapping.min_iterations=24",), ("export.mesh_side=100",),
     ("global_ba.use_loops=false",), ("tracking.use_depth=false",), ("frames.max_features=500",),
 )  # fmt: skip
 """Settings of one round after the other, each beside SETTINGS: rounds begin at different stages."""

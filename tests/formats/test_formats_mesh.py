@@ -21,7 +21,6 @@ from msgs_slam.formats.mesh import (
     write_mesh_glb,
     write_mesh_ply,
     write_textured_glb,
-    write_textured_obj,
 )
 
 
@@ -198,22 +197,6 @@ def square() -> TexturedMesh:
     vertices = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]], np.float32)
     labels, faces = np.array([1, 0, 1, 255], np.uint8), np.array([[0, 1, 2], [3, 4, 5]], np.int32)
     return TexturedMesh(vertices, labels, corner_vertex, spots[corner_vertex], faces, texture)
-
-
-def test_obj_in_a_foreign_reader(tmp_path: Path, square: TexturedMesh) -> None:
-    paths = write_textured_obj(tmp_path / "room.obj", square, ("floor", "white wall"))
-    assert [p.name for p in paths] == ["room.obj", "room.mtl", "room.png"]
-    text = paths[0].read_text()
-    assert text.count("\nv ") == 4
-    assert text.count("\nvt ") == 6
-    assert [line for line in text.splitlines() if line.startswith("g ")] == ["g floor", "g white_wall"]
-    mesh = trimesh.load(paths[0], process=False, force="mesh")
-    assert mesh.area == pytest.approx(1)
-    seen = mesh.visual.to_color().vertex_colors[:, :3]
-    for vertex, color in zip(square.vertices, COLORS, strict=True):
-        assert (seen[(mesh.vertices == vertex).all(1)] == color).all()
-    again = write_textured_obj(tmp_path / "again" / "room.obj", square, ("floor", "white wall"))
-    assert [a.read_bytes() for a in again] == [p.read_bytes() for p in paths]
 
 
 def test_glb_in_foreign_readers(tmp_path: Path, square: TexturedMesh) -> None:

@@ -36,7 +36,7 @@ from msgs_slam.pipelines.types import Metres
 
 OracleRun = Callable[..., RunFolder]
 Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-SETTINGS = ExportConfig(spz=True, splat_glb=True, voxel=0.03)
+SETTINGS = ExportConfig(voxel=0.03)
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +50,7 @@ def folder(run: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(textured, "TEXTURE_SIDE", 512)
         paths = export_run(run, folder, settings=SETTINGS)
+    paths += [path for kind in ("spz", "glb") for path in export_run(run, folder, kind, settings=SETTINGS)]
     assert all(p.exists() for p in paths)
     return folder
 
@@ -133,13 +134,12 @@ def test_texture_shows_the_photographs(run: RunFolder, folder: Path, exported: O
     assert 0 < np.median(difference) < 8
 
 
-def test_obj_alone_and_colours_without_a_texture(run: RunFolder, tmp_path: Path) -> None:
+def test_one_kind_of_mesh_and_colours_without_a_texture(run: RunFolder, tmp_path: Path) -> None:
     few = replace(SETTINGS, texture=False, mesh_side=160)
-    names = [path.name for path in export_run(run, tmp_path / "obj", "obj", settings=few)]
-    assert names == [*(f"mesh.{kind}" for kind in ("obj", "mtl", "png")), "world.json", "README.txt"]
-    assert sorted(p.name for p in (tmp_path / "obj").iterdir()) == sorted([LIST, *names])
-    export_run(run, tmp_path / "mesh", "mesh", settings=few)
-    glb, ply = (trimesh.load(tmp_path / "mesh" / n, force="mesh", process=False) for n in ("mesh.glb", "mesh.ply"))
+    names = [path.name for path in export_run(run, tmp_path, "mesh", settings=few)]
+    assert names == ["mesh.ply", "mesh.glb", "world.json", "README.txt"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([LIST, *names])
+    glb, ply = (trimesh.load(tmp_path / n, force="mesh", process=False) for n in ("mesh.glb", "mesh.ply"))
     np.testing.assert_allclose(glb.vertices[:, [0, 2, 1]] * (1, -1, 1), ply.vertices, atol=1e-5)
 
 
@@ -154,7 +154,7 @@ def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
         "tiles": "tiles/tileset.json",
         "tum": "trajectory.txt",
     }
-    for only in set(EXPORTS) - {"mesh", "obj", "collision", "usd", "floorplan"}:
+    for only in set(EXPORTS) - {"mesh", "collision", "usd", "floorplan"}:
         export_run(run, tmp_path / only, only, settings=ExportConfig(axes="first"))
         assert (tmp_path / only / expected[only]).exists()
         notes = (tmp_path / only / "README.txt").read_text()
@@ -183,13 +183,6 @@ def test_licences_of_the_networks_are_in_the_notes() -> None:
     assert "fast-depth: " in said
     assert "dinov2" not in said
     assert licences([{"depth": "multiview", "semantics": "segments"}], None) == ""
-
-
-def test_rest_coefficients_on_request(run: RunFolder, tmp_path: Path) -> None:
-    export_run(run, tmp_path, "ply", settings=ExportConfig(sh_rest=True))
-    vertex = plyfile.PlyData.read(str(tmp_path / "point_cloud.ply"))["vertex"]
-    assert sum(p.name.startswith("f_rest_") for p in vertex.properties) == 45
-    assert not vertex["f_rest_44"].any()
 
 
 def test_a_track_that_says_too_little_is_warned_of(
@@ -229,10 +222,10 @@ def test_free_scale_holds_in_every_file(oracle_run: OracleRun, tmp_path: Path) -
         writers = [n for n in vars(stage) if n.startswith("write_") and n not in ("write_pieces", "write_readme")]
         for name in set(writers) - {"write_all_but_mesh", "write_meshes", "write_notes", "write_world"}:
             patch.setattr(stage, name, see)
-        for kind in set(EXPORTS) - {"mesh", "obj"}:
+        for kind in set(EXPORTS) - {"mesh"}:
             patch.setattr(stage, "write_world", lambda outcome, world, folder: WORLD.save(folder, world))
             export_run(run, tmp_path / kind, kind, settings=ExportConfig(scale="free"))
-    assert seen == [(None, True)] * (len(EXPORTS) - 2)
+    assert seen == [(None, True)] * (len(EXPORTS) - 1)
 
 
 def test_what_others_keep_in_the_run_s_export_is_kept(oracle_run: OracleRun) -> None:
