@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -153,6 +154,7 @@ def test_tests_and_benchmarks_import_what_there_is() -> None:
     assert not missing
 
 
+@cache
 def names_of(base: Path) -> set[str]:
     """What can be imported from the module or package whose path without suffix is `base`."""
     inside = {p.stem for p in base.iterdir()} if base.is_dir() else set()

@@ -3,6 +3,7 @@
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import click
@@ -86,13 +87,17 @@ def texts_of_pages() -> Iterator[tuple[str, str]]:
             yield str(path.relative_to(ROOT)), "\n".join(re.findall(r">[^<>{}]+<|\"[^\"]* [^\"]*\"", path.read_text()))
 
 
+@cache
+def every_text() -> list[tuple[str, str]]:
+    return [*texts_of_code(), *texts_of_help(main, "msgs-slam"), *texts_of_pages()]
+
+
 @pytest.mark.parametrize("banned", BANNED)
 def test_words_that_may_not_come_back(banned: str) -> None:
-    every = [*texts_of_code(), *texts_of_help(main, "msgs-slam"), *texts_of_pages()]
-    assert len(every) > 800
+    assert len(every_text()) > 800
     found = [
         f"{where}: …{text[max(0, m.start() - 40) : m.end() + 30]!r}"
-        for where, text in every
+        for where, text in every_text()
         for m in re.finditer(banned, text, re.IGNORECASE)
         if not any(stay in text for stay in MAY_STAY)
     ]
