@@ -1,5 +1,7 @@
 """The door for files and paths from outside: what is opened, how much of it, and what its damage is called."""
 
+from __future__ import annotations
+
 import errno
 import hashlib
 import os
@@ -7,9 +9,10 @@ import re
 import stat
 import time
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
 
@@ -303,6 +306,31 @@ def known_sha256(path: Path) -> str:
 def _stamp(path: Path) -> tuple[int, ...]:
     status = path.stat()
     return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+@dataclass(frozen=True)
+class FileStamps:
+    """Files and folders with inode, size and times of each; None where one has just been written, and may be again at
+    the same time of the clock."""
+
+    stamps: Mapping[Path, tuple[int, ...]] | None
+
+    @classmethod
+    def of(cls, paths: Iterable[Path]) -> FileStamps:
+        """Look at files and folders as they are."""
+        try:
+            found = {path: _stamp(path) for path in {*paths}}
+        except OSError:
+            return cls(None)
+        newest = max(max(stamp[2:]) for stamp in found.values()) / 1e9
+        return cls(None if time.time() - newest < _JUST_WRITTEN else found)
+
+    def are_current(self) -> bool:
+        """Return whether nothing has changed since."""
+        try:
+            return self.stamps is not None and all(_stamp(path) == stamp for path, stamp in self.stamps.items())
+        except OSError:
+            return False
 
 
 def files_sha256(

@@ -22,7 +22,8 @@ from .read_config import with_absolute_paths
 from .run.folder import RunFolder, load_records, load_settings, load_source
 from .run.lock import LEADER, LOCK, ProgressFile, RunBusyError, locked, make_folder
 from .run.manifest import StageRecord, recorded_config
-from .source.opening import require_different, source_digest
+from .source.recording import open_recording
+from .source.videos import require_different
 from .system.device import require_device
 from .system.memory import available_cpus
 from .system.progress import Progress, log, stop_if_asked
@@ -122,7 +123,7 @@ def reconstruct(
     require_unicode(source.resolve())  # the manifest names it
     require_unicode(run.root.absolute())
     config = _settled(config, run)
-    digest = source_digest(source, config.run.format)
+    digest = open_recording(source, config.run.format).digest
     _require_run_or_empty(run)
     require_device(config.run.device)  # refused before anything is written
     with locked(run):
@@ -257,7 +258,7 @@ def _run(
             f"lies elsewhere now: `msgs-slam reconstruct SOURCE --out {quoted(run.root)}`"
         )
         try:
-            same = source_digest(source, config.run.format) == digest
+            same = open_recording(source, config.run.format).digest == digest
         except InputError as error:
             _require_format(run, source, digest, config.run.format)
             raise RecoverableError(f"{error}. {kept}") from error
@@ -292,7 +293,7 @@ def _require_format(run: RunFolder, source: Path, digest: str, format: str) -> N
     """Raise RecoverableError where the source is as it was and only read by another `run.format`."""
     was = made_with(run).run.format
     try:
-        is_other = was != format and source_digest(source, was) == digest
+        is_other = was != format and open_recording(source, was).digest == digest
     except InputError:  # which the caller reports
         return
     if not is_other:

@@ -101,7 +101,7 @@ def learn(modules: list[Module]) -> Known:
                 full = own[place].names[last]
                 place, _, last = full.rpartition(".")
             module.names[name] = full
-    for module in modules:  # Source = VideoSource | FolderSource; PAPER = Constants()
+    for module in modules:  # Source = VideoRecording | FolderRecording; PAPER = Constants()
         for node in module.tree.body:
             if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
                 known.values[f"{module.name}.{node.targets[0].id}"] = module.annotated(node.value, known)

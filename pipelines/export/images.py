@@ -18,7 +18,7 @@ from ..outcome import Outcome
 from ..run.files import LEFT_OUT
 from ..run.folder import load_source
 from ..sfm.lens import Lens, distorted_camera, make_lens, to_pycolmap
-from ..source.opening import Source, open_source
+from ..source.recording import Recording, open_recording
 from ..source.sharpness import reduce_image, reduced_size
 from ..system.parallel import parallel_map
 from ..types import Frame, Intrinsics
@@ -64,14 +64,14 @@ def write_masks(outcome: Outcome, frames: list[Frame], camera: Intrinsics, folde
     return [LEFT_OUT.name.format(frame.name) for frame in frames]
 
 
-def _larger(outcome: Outcome, side: int) -> tuple[Source, Lens] | None:
+def _larger(outcome: Outcome, side: int) -> tuple[Recording, Lens] | None:
     """The source, and the lens of its images reduced to `side`; None where these are no larger than the frames, or the
     frames are no whole images of the source. Raises InputError where the source cannot be read."""
     calibration, most = outcome.calibration, outcome.config.frames.max_side
     k = calibration.intrinsics
     if calibration.directions > 1 or calibration.fisheye or max(k.width, k.height) < most:
         return None
-    source = open_source(Path(load_source(outcome.run).path), outcome.config.run.format)
+    source = open_recording(Path(load_source(outcome.run).path), outcome.config.run.format)
     width, height = reduced_size(source.width, source.height, side)
     if reduced_size(source.width, source.height, most) != (k.width, k.height) or width <= k.width:
         return None
@@ -83,7 +83,9 @@ def _larger(outcome: Outcome, side: int) -> tuple[Source, Lens] | None:
     return source, Lens(distorted, pinhole, 0.0 if straight else np.inf)
 
 
-def _write_larger(outcome: Outcome, frames: list[Frame], source: Source, lens: Lens, side: int, folder: Path) -> None:
+def _write_larger(
+    outcome: Outcome, frames: list[Frame], source: Recording, lens: Lens, side: int, folder: Path
+) -> None:
     by_index = {frame.source_index: frame for frame in frames}
 
     def write(picture: VideoFrame) -> None:

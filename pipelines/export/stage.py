@@ -22,7 +22,7 @@ from ..scene.gps import world_on_earth
 from ..scene.metres import find_metres
 from ..scene.upright import find_upright
 from ..scene.world import FIRST, WORLD, World, upright_world, world_figures
-from ..source.opening import is_of_source
+from ..source.recording import is_of_source
 from ..system.memory import release_free_memory
 from ..system.progress import Progress, SilentProgress, log
 from ..types import Metres

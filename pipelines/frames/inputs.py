@@ -12,7 +12,8 @@ from ..run.extension import parent_inputs
 from ..run.files import CALIBRATION
 from ..run.folder import RunFolder, load_records
 from ..source.given import check_poses, intrinsics_inputs, pose_inputs, read_intrinsics
-from ..source.opening import FolderSource, Source, Warn, open_source
+from ..source.recording import FolderRecording, Recording, open_recording
+from ..source.videos import Warn
 from ..system.memory import window_size, windows_of
 from .learned import learned_inputs, open_learned
 from .masks import check_masks, mask_inputs
@@ -38,14 +39,14 @@ def frames_division(run: RunFolder, config: Config) -> list[range]:
 
 def check_frames(source: Path, config: Config) -> None:
     """Raise InputError for a source, or a camera given for it, that cannot be used."""
-    opened = open_source(source, config.run.format)
+    opened = open_recording(source, config.run.format)
     require_several(opened)
     from ..sfm.rolling import read_readout  # pycolmap, for sources that can be used
     from ..source.faces import find_faces
 
     check_masks(source, config)
     open_learned(config.frames)
-    if any(read_readout(config.frames.rolling_shutter) or ()) and not opened.has_times:
+    if any(read_readout(config.frames.rolling_shutter) or ()) and not opened.is_timed():
         raise InputError(
             f"frames.rolling_shutter={config.frames.rolling_shutter} needs to know when each image was taken, and "
             f"{source} does not tell: give the video itself, or put the times in {source.name}/times.txt"
@@ -72,9 +73,9 @@ def _check_panoramas(config: Config) -> None:
         )
 
 
-def require_several(source: Source, warn: Warn | None = None) -> None:
+def require_several(source: Recording, warn: Warn | None = None) -> None:
     """Raise InputError for a folder of one image; warn where images of a folder inside may be meant."""
-    if not isinstance(source, FolderSource):
+    if not isinstance(source, FolderRecording):
         return
     hint = hint_at_inner_folder(source.path, source.expected_frames + 1)
     if len(source.headers.of) < 2:

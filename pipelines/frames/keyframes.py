@@ -16,8 +16,8 @@ from ..config import FramesConfig
 from ..engine.stages import StageContext
 from ..sfm.flow import corners, follow
 from ..source.faces import Faces
-from ..source.opening import Source
 from ..source.overlap import Motion
+from ..source.recording import Recording
 from ..source.sharpness import reduce_image, sharpest_of_windows, sharpness
 from ..types import Frame
 from .masks import picked
@@ -106,7 +106,7 @@ class _Tracker:
         return float(np.median(distance)) / max(gray.shape), survivors
 
 
-def pick_frames(context: StageContext, source: Source, faces: Faces | None) -> list[Frame]:
+def pick_frames(context: StageContext, source: Recording, faces: Faces | None) -> list[Frame]:
     """The sharpest image of every window of time, and more images where these hardly overlap, kept in the snapshot.
 
     Raises InputError for a source of one.
@@ -120,7 +120,7 @@ def pick_frames(context: StageContext, source: Source, faces: Faces | None) -> l
                 context.warn(message)
             return frames
     config, earlier = context.config.frames, len(context.warnings)  # those before are given again by who gave them
-    rate = config.rate if source.has_times else 0.0
+    rate = config.rate if source.is_timed() else 0.0
     motion = Motion()
     frames = _saved(context, source, faces, _sharpest(context, source, rate, motion))
     wanted = motion.wanted() if rate > 0 else []
@@ -136,7 +136,9 @@ def pick_frames(context: StageContext, source: Source, faces: Faces | None) -> l
     return frames
 
 
-def _sharpest(context: StageContext, source: Source, rate: float, motion: Motion) -> Iterator[tuple[VideoFrame, float]]:
+def _sharpest(
+    context: StageContext, source: Recording, rate: float, motion: Motion
+) -> Iterator[tuple[VideoFrame, float]]:
     """The sharpest images with their sharpness, by whose `motion` it is judged whether these are enough."""
     pictures = context.progress.track(source.read(warn=context.warn), "picking", source.expected_frames or None)
     if rate <= 0:
@@ -148,13 +150,13 @@ def _sharpest(context: StageContext, source: Source, rate: float, motion: Motion
 
 
 def _saved(
-    context: StageContext, source: Source, faces: Faces | None, chosen: Iterable[tuple[VideoFrame, float]]
+    context: StageContext, source: Recording, faces: Faces | None, chosen: Iterable[tuple[VideoFrame, float]]
 ) -> list[Frame]:
     """The frames of images with their sharpness, each written to the snapshot."""
     frames: list[Frame] = []
     for picture, score in chosen:
         frame_id = len(frames)
-        timestamp = picture.timestamp if source.has_times else _untimed(context.config.frames, frame_id)
+        timestamp = picture.timestamp if source.is_timed() else _untimed(context.config.frames, frame_id)
         name = source.name(frame_id, picture.source_index)
         frames.append(Frame(frame_id, name, timestamp, picture.source_index, score))
         _save_picked(context, source, picture, name, faces)
@@ -171,7 +173,7 @@ def _untimed(config: FramesConfig, frame_id: int) -> float:
     return frame_id / (config.rate if config.rate > 0 else 1.0)
 
 
-def _save_picked(context: StageContext, source: Source, picture: VideoFrame, name: str, faces: Faces | None) -> None:
+def _save_picked(context: StageContext, source: Recording, picture: VideoFrame, name: str, faces: Faces | None) -> None:
     if faces is not None:
         for face, rgb in zip(faces.names(name), faces.cut(picture.rgb), strict=True):
             write_rgb(picked(context, face), rgb)

@@ -27,7 +27,7 @@ from ..geometry.camera import ONE_CAMERA, Rig
 from ..masks.people import PeopleCards, PeopleFinder, people_cards
 from ..networks.registry import ModelStore
 from ..run.files import LEFT_OUT
-from ..source.opening import FolderSource, Source, VideoSource, open_source
+from ..source.recording import Recording, VideoRecording, open_recording
 from ..system.progress import Progress
 from ..types import Frame, any_of
 
@@ -48,14 +48,14 @@ def mask_inputs(source: Path, config: Config) -> dict[str, str] | None:
     names_masks = config.run.format != "images" and recognise_source(source) is not None
     files = MaskFiles({})
     if config.frames.masks or names_masks:
-        files = masks_for(config, open_source(source, config.run.format))
+        files = masks_for(config, open_recording(source, config.run.format))
     cards, found = _cards(config), {"masks": files.digest()} if files.paths else {}
     return found | ({"people": cards.identity()} if cards else {}) or None
 
 
 def check_masks(source: Path, config: Config) -> None:
     """InputError for masks of another name or size than the images, and networks that are not what they should be."""
-    masks_for(config, open_source(source, config.run.format))
+    masks_for(config, open_recording(source, config.run.format))
     if cards := _cards(config):
         PeopleFinder(cards, 1)
 
@@ -73,7 +73,7 @@ class FrameMasks:
     """
 
     def __init__(
-        self, config: Config, source: Source, folder: Path, picked: Path, threads: int,
+        self, config: Config, source: Recording, folder: Path, picked: Path, threads: int,
         faces: Faces | None = None, rig: Rig = ONE_CAMERA,
     ) -> None:  # fmt: skip
         self._source, self._are_given = source, bool(config.frames.masks)
@@ -245,15 +245,14 @@ def reduce_mask(left_out: NDArray[np.bool_], width: int, height: int) -> NDArray
     return np.asarray(cv2.resize(scene, (width, height), interpolation=cv2.INTER_AREA) <= 0.5)
 
 
-def masks_for(config: Config, source: Source) -> MaskFiles:
+def masks_for(config: Config, source: Recording) -> MaskFiles:
     """Return the masks of --masks, else those that the source names itself. Raises InputError as `open_masks`."""
     if config.frames.masks:
         return open_masks(Path(config.frames.masks), source)
-    named = () if isinstance(source, VideoSource) else source.sequence.mask_paths
-    return _of_one_size({i: path for i, path in enumerate(named) if path is not None}, source)
+    return _of_one_size(source.masks(), source)
 
 
-def open_masks(folder: Path, source: Source) -> MaskFiles:
+def open_masks(folder: Path, source: Recording) -> MaskFiles:
     """The masks of a source's images: NAME.jpg.png or NAME.png for the image NAME.jpg, or the number of the frame in
     the video (from 0). Not every image needs one.
 
@@ -264,11 +263,11 @@ def open_masks(folder: Path, source: Source) -> MaskFiles:
     files = sorted((p for p in folder.rglob("*.png") if p.is_file()), key=lambda p: natural_key(p.name))
     if not files:
         raise InputError(f"--masks {folder}: holds no PNG files. A mask is an 8 bit PNG, black is left out")
-    paths, strangers = _by_number(files, source) if isinstance(source, VideoSource) else _by_name(files, source)
+    paths, strangers = _by_number(files, source) if isinstance(source, VideoRecording) else _by_name(files, source)
     if strangers:
         rule = (
             "the number of the frame in the video, the first is 0"
-            if isinstance(source, VideoSource)
+            if isinstance(source, VideoRecording)
             else "that of the image with .png after it"
         )
         raise InputError(
@@ -278,10 +277,10 @@ def open_masks(folder: Path, source: Source) -> MaskFiles:
     return _of_one_size(paths, source)
 
 
-def _of_one_size(paths: dict[int, Path], source: Source) -> MaskFiles:
+def _of_one_size(paths: dict[int, Path], source: Recording) -> MaskFiles:
     turns = {}
     for index, path in paths.items():
-        turn = source.turns_from_upright(index) if isinstance(source, FolderSource) else 0
+        turn = source.turns_from_upright(index)
         size = image_size(path)
         if turn == 2 or (turn and size == (source.height, source.width)):
             turns[index], size = turn, (source.width, source.height)
@@ -293,14 +292,14 @@ def _of_one_size(paths: dict[int, Path], source: Source) -> MaskFiles:
     return MaskFiles(paths, turns)
 
 
-def _by_number(files: list[Path], source: Source) -> tuple[dict[int, Path], list[Path]]:
+def _by_number(files: list[Path], source: Recording) -> tuple[dict[int, Path], list[Path]]:
     last = source.expected_frames or 1 << 62
     paths = {n: p for p in files if (n := frame_number(p)) is not None and n < last}
     return paths, [p for p in files if (n := frame_number(p)) is None or n >= last]
 
 
-def _by_name(files: list[Path], source: Source) -> tuple[dict[int, Path], list[Path]]:
-    places = [] if isinstance(source, VideoSource) else [source.place(i) for i in range(source.expected_frames)]
+def _by_name(files: list[Path], source: Recording) -> tuple[dict[int, Path], list[Path]]:
+    places = [source.place(i) for i in range(source.expected_frames)]
     found = match_names([str(p.with_suffix("")) for p in files], places)
     paths = {i: p for i, p in zip(found, files, strict=True) if i is not None}
     return paths, [p for i, p in zip(found, files, strict=True) if i is None]
@@ -321,7 +320,7 @@ def _still_name(direction: int) -> str:
     return f"still_{direction}"
 
 
-def masks_of(context: StageContext, source: Source, faces: Faces | None, rig: Rig) -> FrameMasks:
+def masks_of(context: StageContext, source: Recording, faces: Faces | None, rig: Rig) -> FrameMasks:
     """Return the masks of all frames; people only in frames that have been searched."""
     places = context.snapshot / "left_out", context.snapshot / "picked"
     return FrameMasks(context.config, source, *places, context.threads, faces, rig)

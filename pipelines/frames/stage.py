@@ -28,7 +28,7 @@ from ..sfm.parallax import require_motion
 from ..sfm.rolling import straight_copy
 from ..source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
 from ..source.given import given_poses
-from ..source.opening import FolderSource, Source, open_source
+from ..source.recording import FolderRecording, Recording, open_recording
 from ..source.sharpness import reduce_image
 from ..system.parallel import parallel_map
 from ..types import Calibration, Frame, GivenPoses
@@ -57,7 +57,7 @@ _NOISE_IMAGES = 8
 
 def run(context: StageContext) -> dict[str, Any]:
     """See `StageContext`; raises InputError for a source that cannot be used."""
-    source = open_source(context.source, context.config.run.format)
+    source = open_recording(context.source, context.config.run.format)
     faces = find_faces(source, context.config.frames)
     if faces is None and looks_like_panoramas(source, context.config.frames):
         context.warn(
@@ -74,7 +74,7 @@ def run(context: StageContext) -> dict[str, Any]:
         keyframes = _keyframes(context, frames, masks, rig)
         masks.find_people(frames, keyframes, context.progress)
         structure, origin = _structure(
-            context, (camera, origin), frames, keyframes, masks, rig, given, source.has_times
+            context, (camera, origin), frames, keyframes, masks, rig, given, source.is_timed()
         )
     except InputError as error:
         if blame := masks.blame(frames, camera.width, camera.height):
@@ -88,7 +88,7 @@ def run(context: StageContext) -> dict[str, Any]:
     if len(rig) == 1:
         times = np.array([frames[k].timestamp for k in keyframes])
         straight = straight_copy(structure.model, [f.xy for f in structure.features], times, structure.readout)
-        origin = warn_of_focal(context, origin, camera, structure, straight, source.has_times)
+        origin = warn_of_focal(context, origin, camera, structure, straight, source.is_timed())
         evenly = keyframes[:: -(-len(keyframes) // _NOISE_IMAGES)]
         noise = warn_of_defects(context, [grey_of(context, masks, frames[k])[0] for k in evenly], straight)
         if structure.focal_sd:
@@ -104,13 +104,13 @@ def run(context: StageContext) -> dict[str, Any]:
     if given is not None:
         GIVEN_POSES.save(context.folder, given)
     panoramas = {"panoramas": rig.stations} if len(rig) > 1 else {}
-    told |= places_figure(source, frames) | ({} if source.has_times else {"timed": False})
+    told |= places_figure(source, frames) | ({} if source.is_timed() else {"timed": False})
     return _figures(frames, structure, calibration) | told | panoramas | masked | still.figures
 
 
-def places_figure(source: Source, frames: list[Frame]) -> dict[str, str]:
+def places_figure(source: Recording, frames: list[Frame]) -> dict[str, str]:
     """Count the images that say by GPS where they were taken, where any does."""
-    if not isinstance(source, FolderSource):
+    if not isinstance(source, FolderRecording):
         return {}
     places = photo_places([source.file(frame.source_index) for frame in frames])
     count = int(np.isfinite(places[:, :2]).all(axis=1).sum())
@@ -256,7 +256,7 @@ def _write_correspondences(context: StageContext, structure: Structure, keyframe
     MATCHED_PAIRS.save(context.folder, tried)
 
 
-def _write_frames(context: StageContext, source: Source, frames: list[Frame], lens: Lens) -> None:
+def _write_frames(context: StageContext, source: Recording, frames: list[Frame], lens: Lens) -> None:
     """The frames without distortion; those of a lens without any are the picked ones, byte for byte."""
     missing = [f for f in frames if not (context.folder / f.name).exists()]
     if lens.is_straight:
@@ -277,7 +277,7 @@ def _write_frames(context: StageContext, source: Source, frames: list[Frame], le
     _require_all(context, source, missing)
 
 
-def _require_all(context: StageContext, source: Source, frames: list[Frame]) -> None:
+def _require_all(context: StageContext, source: Recording, frames: list[Frame]) -> None:
     """The source has given all of these frames again, as they were."""
     try:
         context.same_source()

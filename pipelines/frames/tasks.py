@@ -21,8 +21,7 @@ from ..sfm.rolling import frame_interval
 from ..sfm.snapshots import Snapshots, features_name
 from ..source.faces import Faces, find_faces
 from ..source.given import given_poses, read_intrinsics
-from ..source.opening import Source, open_source
-from ..source.recording import RecordingSource
+from ..source.recording import Recording, open_recording
 from ..source.sharpness import reduced_size
 from ..system.memory import window_size
 from ..system.progress import Progress
@@ -31,7 +30,7 @@ from .learned import open_learned, picture_features
 from .masks import FrameMasks, grey_of, masks_of, picked
 
 
-def known_camera(context: StageContext, source: Source, faces: Faces | None) -> tuple[pycolmap.Camera, str]:
+def known_camera(context: StageContext, source: Recording, faces: Faces | None) -> tuple[pycolmap.Camera, str]:
     """The camera of the reduced frames as far as it is known before, and where from: given by the user, stated by the
     data set, exif, or nowhere."""
     config = context.config.frames
@@ -45,7 +44,7 @@ def known_camera(context: StageContext, source: Source, faces: Faces | None) -> 
     if config.intrinsics:
         given = read_intrinsics(config.intrinsics, source.width, source.height)
         return to_pycolmap(given.resized(width, height)), "given"
-    known = source.known_camera() if isinstance(source, RecordingSource) else None
+    known = source.camera()
     if known is not None and not known.is_nominal and not known.fisheye:
         return to_pycolmap(known.resized(width, height)), "stated"
     if known is not None:
@@ -123,13 +122,13 @@ def _opened(task: Chunk, progress: Progress) -> StructureFromMotion:
     if task.opened is not None:
         return task.opened
     context, frames = task.context(progress), task.known["frames"]
-    source = open_source(context.source, context.config.run.format)
+    source = open_recording(context.source, context.config.run.format)
     faces = find_faces(source, context.config.frames)
     camera, origin = known_camera(context, source, faces)
     rig = rig_of(1 if faces is None else len(faces), len(frames))
     masks = masks_of(context, source, faces, rig)
     given = given_poses(context.config.frames, source, frames)
-    return structure_from_motion(context, camera, origin, frames, masks, rig, given, source.has_times)
+    return structure_from_motion(context, camera, origin, frames, masks, rig, given, source.is_timed())
 
 
 def _proposed(task: Chunk) -> list[tuple[int, int]]:

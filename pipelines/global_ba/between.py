@@ -25,7 +25,7 @@ from ..sfm.adjust import FEATURE_SD
 from ..sfm.lens import distorted_camera, make_lens, to_pycolmap
 from ..sfm.rolling import Shutter, velocities
 from ..source.faces import find_faces
-from ..source.opening import Source, open_source
+from ..source.recording import Recording, open_recording
 from ..source.sharpness import reduce_image
 from ..system.progress import is_asked
 from ..system.values import load_value, save_value
@@ -68,8 +68,8 @@ def pose_every_frame(context: StageContext, model: SparseModel, trajectory: Traj
     if settings.global_ba.posed == "picked" or settings.frames.rate == 0:
         return {}
     try:
-        source = open_source(context.source, settings.run.format)
-        if not source.has_times:
+        source = open_recording(context.source, settings.run.format)
+        if not source.is_timed():
             return {}
         context.same_source()
         placed = place_all(context, source, Placer(context, model, trajectory))
@@ -106,7 +106,7 @@ def with_placed(run: RunFolder, trajectory: Trajectory, placed: list[Placed]) ->
     )
 
 
-def place_all(context: StageContext, source: Source, placer: Placer) -> list[Placed]:
+def place_all(context: StageContext, source: Recording, placer: Placer) -> list[Placed]:
     """Place the images that were not picked, in order; goes on from the last snapshot."""
     snapshot = context.snapshot / "between.npz"
     placed: list[Placed] = load_value(snapshot) if snapshot.exists() else []

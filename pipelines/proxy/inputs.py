@@ -11,8 +11,7 @@ from ..config import Config
 from ..networks.registry import missing_networks
 from ..networks.session import card_identity
 from ..providers import Sequence
-from ..source.opening import open_source
-from ..source.recording import RecordingSource
+from ..source.recording import open_recording
 from ..system.progress import SilentProgress, log
 from ..types import Calibration, Frame, Intrinsics
 from .selection import (
@@ -63,7 +62,7 @@ def check_proxy(source: Path, config: Config) -> None:
     if config.proxy.scale_ref.strip() == POSES and not config.frames.poses:
         raise InputError("--scale-ref poses needs poses: give them with --poses FILE|FOLDER")
     if config.proxy.scale_ref:
-        require_reference_in(open_source(source, config.run.format), config.proxy.scale_ref)
+        require_reference_in(open_recording(source, config.run.format), config.proxy.scale_ref)
     depth, semantics = choose_depth(config.proxy), choose_semantics(config.proxy)
     if config.proxy.semantics == "auto" and (line := missing_networks()):
         log.warning(line)
@@ -87,7 +86,7 @@ def _digest_of(files: list[Path]) -> str:
 
 def _before_frames(source: Path, config: Config) -> ProviderContext:
     """As if every image of the source were a frame; none of them is decoded."""
-    pictures = open_source(source, config.run.format)
+    pictures = open_recording(source, config.run.format)
     width, height = pictures.width, pictures.height
     camera = Intrinsics(width, height, width, width, width / 2, height / 2)
     names = [Frame(i, pictures.name(i, i), 0.0, i, 0.0) for i in range(pictures.expected_frames)]
@@ -97,6 +96,5 @@ def _before_frames(source: Path, config: Config) -> ProviderContext:
     def nothing(_: Any) -> Any:
         raise AssertionError("providers are only opened here")
 
-    recording = pictures.sequence if isinstance(pictures, RecordingSource) else None
     sequence = Sequence(names, calibration, small, None, nothing)
-    return ProviderContext(source, sequence, config.proxy, nothing, 1, "cpu", SilentProgress(), recording)
+    return ProviderContext(source, sequence, config.proxy, nothing, 1, "cpu", SilentProgress(), pictures.dataset())

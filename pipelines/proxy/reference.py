@@ -23,7 +23,7 @@ from ..run.files import BACKBONE, GIVEN_POSES
 from ..run.folder import RunFolder
 from ..sfm.flow import follow
 from ..sfm.given import agreement
-from ..source.opening import Source, VideoSource, open_source
+from ..source.recording import Recording, VideoRecording, open_recording
 from ..types import Frame, Intrinsics
 
 Array = NDArray[np.float64]
@@ -78,7 +78,7 @@ def parse_reference(text: str) -> Reference | None:
     return Reference(_positive(found[6], text), found[1].strip(), ((x1, y1), (x2, y2)))
 
 
-def require_reference_in(source: Source, text: str) -> None:
+def require_reference_in(source: Recording, text: str) -> None:
     """Raise InputError for a reference that is malformed, to an image the source does not have, or outside it."""
     reference = parse_reference(text)
     if reference is None or not reference.picture:
@@ -90,7 +90,7 @@ def require_reference_in(source: Source, text: str) -> None:
 
 
 def distance_scale(
-    reference: Reference, source: Source, sequence: Sequence, frames: list[Frame], depth_of: DepthOf
+    reference: Reference, source: Recording, sequence: Sequence, frames: list[Frame], depth_of: DepthOf
 ) -> ReferenceScale:
     """The scale that makes the two points as far apart as they are known to be.
 
@@ -129,9 +129,9 @@ def height_scale(reference: Reference, heights: Array) -> ReferenceScale:
     return ReferenceScale(reference.metres / height, float(np.std(heights)) / height, len(heights))
 
 
-def _picture_index(source: Source, picture: str) -> int:
+def _picture_index(source: Recording, picture: str) -> int:
     """Index in the source of an image: by its name, or the number of the video's frame."""
-    if isinstance(source, VideoSource):
+    if isinstance(source, VideoRecording):
         # Headers of videos may promise no frames at all.
         if not picture.isdecimal() or 0 < source.expected_frames <= int(picture):
             last = source.expected_frames - 1
@@ -212,7 +212,7 @@ def reference_scale(
         return None if depths.metric else given_scale(context.run, scale, is_said)
 
     if known.picture:
-        source = open_source(context.source, context.config.run.format)
+        source = open_recording(context.source, context.config.run.format)
         found = distance_scale(known, source, sequence, frames, depth_of)
     else:
         segments = SegmentLabels(sequence, MAX_CLASSES, context.progress)

@@ -17,7 +17,7 @@ from ..networks.network_pass import ResultCache, Workplace
 from ..networks.registry import ModelStore, default_cache
 from ..networks.words import with_words
 from ..providers import MAX_CLASSES, DepthProvider, SemanticsProvider, Sequence
-from ..source.opening import FolderSource
+from ..source.recording import FolderRecording
 from ..system.progress import Progress
 
 if TYPE_CHECKING:
@@ -194,7 +194,7 @@ def _turns_of(around: ProviderContext) -> dict[int, int]:
     phone that was turned between them are all turned alike."""
     if around.recording is not None or not around.source.is_dir():
         return {}
-    photos = FolderSource(around.source)
+    photos = FolderRecording(around.source)
     return {f.id: turn for f in around.sequence.frames if (turn := photos.turns_from_upright(f.source_index))}
 
 

@@ -57,7 +57,7 @@ class ProxyWork:
     def _around(self) -> ProviderContext:
         """What the providers are made from."""
         context, config = self.context, self.context.config
-        recording = open_recording(context.source, config.run.format)
+        recording = open_recording(context.source, config.run.format).dataset()
         return ProviderContext(
             context.source, self.sequence, config.proxy, lambda name: context.snapshot / name, context.threads,
             context.device, context.progress, recording, config.run.cache_mb, config.frames.people != "keep",

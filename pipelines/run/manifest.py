@@ -22,7 +22,7 @@ FORMAT = 2
 
 @dataclass(frozen=True)
 class Source:
-    """Source of a run: its path, and the identity of its content (`source_digest`)."""
+    """Source of a run: its path, and the identity of its content (`Recording.digest`)."""
 
     path: str
     digest: str

@@ -15,7 +15,7 @@ from ..config import GPS_AUTO, GPS_OFF
 from ..geometry.se3 import Similarity
 from ..outcome import Outcome
 from ..run.folder import load_source
-from ..source.opening import FolderSource, open_source
+from ..source.recording import FolderRecording, open_recording
 from ..system.progress import log
 from .world import Georeference, World
 
@@ -68,10 +68,10 @@ def _laid_out(outcome: Outcome, world: World, places: Array) -> World | str:
 def _exif_places(outcome: Outcome) -> Array:
     none = np.full((len(outcome.frames), 3), np.nan)
     try:
-        source = open_source(Path(load_source(outcome.run).path), outcome.config.run.format)
+        source = open_recording(Path(load_source(outcome.run).path), outcome.config.run.format)
     except InputError:
         return none  # moved away since: its contribution is lost, and nothing else
-    if not isinstance(source, FolderSource):
+    if not isinstance(source, FolderRecording):
         return none
     return photo_places([source.file(frame.source_index) for frame in outcome.frames])
 

@@ -19,8 +19,7 @@ from ..geometry.camera import CUBE, LEVEL
 from ..sfm.lens import make_lens, to_pycolmap
 from ..types import Intrinsics
 from .given import read_intrinsics
-from .opening import Source, VideoSource
-from .recording import RecordingSource
+from .recording import FolderRecording, Recording, VideoRecording
 from .sharpness import reduced_size
 
 Pixel = TypeVar("Pixel", np.uint8, np.bool_)
@@ -69,7 +68,7 @@ class Faces:
         return cv2.remap(small, *self.maps[camera], how, borderMode=border).astype(np.uint8, copy=False)
 
 
-def find_faces(source: Source, config: FramesConfig) -> Faces | None:
+def find_faces(source: Recording, config: FramesConfig) -> Faces | None:
     """None for images that are a plain camera's already.
 
     Raises InputError for a panorama that is not whole, and a fisheye whose lens is not known where `frames.camera` says
@@ -92,25 +91,25 @@ def find_faces(source: Source, config: FramesConfig) -> Faces | None:
     return None if lens is None else fisheye_face(lens, config.max_side)
 
 
-def looks_like_panoramas(source: Source, config: FramesConfig) -> bool:
+def looks_like_panoramas(source: Recording, config: FramesConfig) -> bool:
     """Whether the images have the shape of panoramas, and nothing says what they are."""
-    unsaid = config.camera == "auto" and not config.intrinsics and not isinstance(source, RecordingSource)
+    unsaid = config.camera == "auto" and not config.intrinsics and source.dataset() is None
     return unsaid and source.width == 2 * source.height
 
 
-def _said(source: Source) -> str:
-    if isinstance(source, RecordingSource):
-        return ""
-    return video_sphere(source.files[0]) if isinstance(source, VideoSource) else image_sphere(source.file(0))
+def _said(source: Recording) -> str:
+    if isinstance(source, VideoRecording):
+        return video_sphere(source.files[0])
+    return image_sphere(source.file(0)) if isinstance(source, FolderRecording) else ""
 
 
-def _fisheye(source: Source, config: FramesConfig) -> Camera | None:
+def _fisheye(source: Recording, config: FramesConfig) -> Camera | None:
     if config.intrinsics:
         camera: Camera | None = read_intrinsics(config.intrinsics, source.width, source.height)
         if config.camera == "fisheye" and camera is not None:
             camera = replace(camera, fisheye=True)
     else:
-        camera = source.known_camera() if isinstance(source, RecordingSource) else None
+        camera = source.camera()
     return camera if camera is not None and camera.fisheye and not camera.is_nominal else None
 
 

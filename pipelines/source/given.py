@@ -19,7 +19,8 @@ from ...formats.reading import file_sha256, files_sha256, home_expanded, noting_
 from ...formats.textfile import read_rows
 from ..config import FramesConfig
 from ..types import Frame, GivenPoses
-from .opening import Source, VideoSource, Warn
+from .recording import Recording, VideoRecording
+from .videos import Warn
 
 _HOW = "give fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file that holds them"
 _MAX_NAMED = 8
@@ -30,7 +31,7 @@ MIN_POSES = 3
 
 
 def given_poses(
-    config: FramesConfig, source: Source, frames: Sequence[Frame], warn: Warn | None = None
+    config: FramesConfig, source: Recording, frames: Sequence[Frame], warn: Warn | None = None
 ) -> GivenPoses | None:
     """The poses of `frames.poses` frame by frame; None where none are given.
 
@@ -45,7 +46,7 @@ def given_poses(
     file = read_poses(Path(config.poses))
     if file.names:
         found = _by_name(file, source, frames, config.poses)
-    elif file.times is not None and source.has_times:
+    elif file.times is not None and source.is_timed():
         found = poses_at(np.array([f.timestamp for f in frames]), file.times, file.world_from_cam, SAME_INSTANT_SECONDS)
     else:
         found = _by_order(file, source, frames, config.poses)
@@ -83,13 +84,13 @@ def numbering(config: FramesConfig, frames: Sequence[Frame], fits: Callable[[NDA
     return ""
 
 
-def check_poses(config: FramesConfig, source: Source) -> None:
+def check_poses(config: FramesConfig, source: Recording) -> None:
     """Raise InputError for poses that cannot belong to the source, as far as its names and their number show."""
     if not config.poses:
         return
     file = read_poses(Path(config.poses))
     pictures = [Frame(i, source.name(i, i), 0.0, i, 0.0) for i in range(source.expected_frames)]
-    if file.names or file.times is None or not source.has_times:
+    if file.names or file.times is None or not source.is_timed():
         given_poses(config, source, pictures)
 
 
@@ -104,9 +105,9 @@ def pose_inputs(config: FramesConfig) -> dict[str, str]:
     return {"poses": files_sha256(named)}
 
 
-def _by_name(file: PoseFile, source: Source, frames: Sequence[Frame], path: str) -> NDArray[np.float64]:
+def _by_name(file: PoseFile, source: Recording, frames: Sequence[Frame], path: str) -> NDArray[np.float64]:
     """A video's frames are called by their numbers."""
-    if isinstance(source, VideoSource):
+    if isinstance(source, VideoRecording):
         numbers = [frame_number(Path(stem(n).replace(".", "_"))) for n in file.names]
         twice = next((n for n, count in Counter(numbers).items() if n is not None and count > 1), None)
         if twice is not None:
@@ -116,7 +117,7 @@ def _by_name(file: PoseFile, source: Source, frames: Sequence[Frame], path: str)
     return _rows(file, match_names([source.place(f.source_index) for f in frames], file.names))
 
 
-def _by_order(file: PoseFile, source: Source, frames: Sequence[Frame], path: str) -> NDArray[np.float64]:
+def _by_order(file: PoseFile, source: Recording, frames: Sequence[Frame], path: str) -> NDArray[np.float64]:
     if source.expected_frames != len(file):
         raise InputError(
             f"--poses {path}: {len(file)} poses for {source.expected_frames} images, and neither names nor times "

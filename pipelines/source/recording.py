@@ -1,12 +1,15 @@
-"""Images and data sets as a source: images, times and camera as a reader gives them; whether they are of one camera, by
-all that their headers say; names of frames, and files that can serve as them unchanged."""
+"""The source of a run, a video, a folder of images or a data set: opened once, read alike, known by one digest.
+
+What it may not know has to be asked for: `camera`, `is_timed`, `dataset`.
+"""
 
 from __future__ import annotations
 
-import itertools
-from collections import Counter
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+import math
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Container, Iterable, Iterator
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -15,49 +18,202 @@ from numpy.typing import NDArray
 
 from ...formats.datasets import Camera, Sequence, open_sequence, recognise_source
 from ...formats.errors import InputError
-from ...formats.exif import QUARTER_TURNS, ExifLens
-from ...formats.images import UNUSABLE, Header, Reading, is_plain, read_deep, read_header, read_rgb, read_transparent
-from ...formats.reading import LONGEST_NAME, is_plain_name
-from ...formats.video import VideoFrame
-
-_ALIKE = 1.05
-"""Focal lengths that differ by less are one: EXIF rounds to whole millimetres, which are 4 % of 25, and the focus moves
-the lens by 2 to 3 %."""
-_MAX_NAMED = 4
-_MOST = 0.8
-"""Of the images of a folder: if so many are of one size, the others are no part of it (screenshots, thumbnails)."""
-_SAMPLED_IMAGES, _SAMPLED_STEP = 24, 3
-_SPAN_PERCENTILES = 0.5, 99.5
-_LARGEST_16_BIT = 65535
-Size = tuple[int, int]
-_Key = Callable[[ExifLens], float | None]
+from ...formats.image_folder import list_images, read_image_times, times_file, unread_images
+from ...formats.images import Header, Reading, is_depth_map, is_plain, read_rgb, read_transparent
+from ...formats.reading import (
+    LONGEST_NAME,
+    FileStamps,
+    files_sha256,
+    is_plain_name,
+    known_sha256,
+    noting_files,
+    opened,
+    reaching,
+    require_file,
+)
+from ...formats.video import VideoFrame, VideoReader, probe_video
+from ..run.folder import RunFolder
+from .headers import Headers, common_span, read_headers, require_one_lens
+from .videos import Warn, video_files, warn_of_video
 
 WRITTEN_SUFFIXES = (".jpg", ".jpeg", ".png")
 
-Warn = Callable[[str], None]
+_PAUSE = 10.0
+"""Seconds on the clock of the run between two videos: no velocity goes on from one to the next."""
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+"""Begins an address; a path has lost one of its slashes."""
+_ARCHIVE_HEADS = (
+    b"PK\3\4", b"\x1f\x8b", b"BZh", b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07", b"\xfd7zXZ\0", b"\x28\xb5\x2f\xfd",
+)  # fmt: skip
+_TAR_MARK_AT = 257
 
 
-def open_recording(path: Path, format: str) -> Sequence | None:
-    """The data set that a source is; None for a video and for plain images.
+class Recording(ABC):
+    """Images of one camera in the order of time, as `open_recording` finds them.
 
-    format: `auto` looks for what the path is; `images` takes it for a video or plain images in any case. Raises
-    InputError where the path is no such data set.
+    `width` and `height` are those of every image that `read` gives; `expected_frames` is an estimate before reading,
+    0 = unknown.
     """
+
+    path: Path
+    width: int
+    height: int
+    expected_frames: int
+
+    @property
+    @abstractmethod
+    def digest(self) -> str:
+        """Identity of the content: a video's bytes; names and bytes of images, their times, and a data set's camera.
+        Other files in the folder do not count. Taken when it is first asked for."""
+
+    @abstractmethod
+    def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
+        """Decode from start to end, and hand out the wanted images (None = all) one at a time, their time NaN unless
+        `is_timed`; damage, and what was left out, is reported to `warn`."""
+
+    @abstractmethod
+    def name(self, frame_id: int, index: int) -> str:
+        """Return the file name of a frame made of image `index`."""
+
+    def place(self, index: int) -> str:
+        """Return the path by which other programs may name image `index`, its name where it is no file."""
+        return self.name(index, index)
+
+    def is_timed(self) -> bool:
+        """Return whether it says when each of its images was taken."""
+        return True
+
+    def camera(self) -> Camera | None:
+        """Return the camera that a data set states, at the size of its images; None without."""
+        return None
+
+    def dataset(self) -> Sequence | None:
+        """Return the data set with its depth, labels and poses; None for a video and for plain images."""
+        return None
+
+    def masks(self) -> dict[int, Path]:
+        """Return the masks that a data set names, by the images' numbers."""
+        return {}
+
+    def original(self, index: int) -> Path | None:
+        """Return the file of image `index`, unless other programs would see it turned, transparent or not at all."""
+        return None
+
+    def transparent(self, index: int) -> NDArray[np.bool_] | None:
+        """Return (height, width) the pixels that an image's alpha channel makes transparent; None without any."""
+        return None
+
+    def turns_from_upright(self, index: int) -> int:
+        """Return the anticlockwise quarter turns by which image `index` differs from its upright view."""
+        return 0
+
+    def exif_focal(self) -> float | None:
+        """Return the focal length in pixels that the images state; None without."""
+        return None
+
+
+_opened: dict[tuple[Path, str], tuple[FileStamps, Recording]] = {}
+"""The last one that was opened, and the files that this has read."""
+
+
+def open_recording(path: Path, format: str = "auto") -> Recording:
+    """Open a video file, a folder of images or a data set; the same object again as long as its files stay.
+
+    format: `auto` looks for what the path is; `images` takes it for a video or plain images in any case; else a data
+    set's. Raises InputError when there is no such file, it is no video, it holds no image, or images differ in size.
+    """
+    require_source(path)
+    key = (path.absolute(), format)
+    if (known := _opened.get(key)) is not None and known[0].are_current():
+        return known[1]
+    with noting_files() as files:
+        recording = _open(path, format)
+    folders = [] if isinstance(recording, VideoRecording) else [path, *(file.parent for file in files)]
+    _opened.clear()
+    _opened[key] = FileStamps.of([*files, *folders]), recording
+    return recording
+
+
+def _open(path: Path, format: str) -> Recording:
     found = recognise_source(path) if format == "auto" else format
-    return None if found is None or found == "images" else open_sequence(path, found)
+    if found is not None and found != "images":
+        return DatasetRecording(open_sequence(path, found))
+    return FolderRecording(path) if path.is_dir() else VideoRecording(path)
 
 
-class ImageSource:
-    """Images of one size in the order of time: those of a sequence, whatever else that holds.
+def require_source(path: Path) -> None:
+    """Raise InputError unless the path is a folder or a file with something in it, and may be read."""
+    if _URL.match(str(path)) and not path.exists():
+        address = str(path).replace(":/", "://", 1)
+        raise InputError(f"{address} is a URL: download it first, then give the file (nothing is fetched)")
+    with reaching(path):
+        if path.is_dir():
+            next(path.iterdir(), None)
+            return
+    require_file(path)
+    with opened(path) as file:
+        head = file.read(_TAR_MARK_AT + 5)
+    if head.startswith(_ARCHIVE_HEADS) or head[_TAR_MARK_AT:] == b"ustar":
+        raise InputError(f"{path} is an archive: unpack it first, then give the video or the folder that was in it")
 
-    `has_times` says whether the images have times, else those of `read` count them; `headers` are those of the images
-    that can be read.
-    """
+
+# videos -----------------------------------------------------------------------------------------------------------
+
+
+class VideoRecording(Recording):
+    """A video file, or several of one place by one camera: see `video_files`. Their frames are counted on."""
+
+    def __init__(self, path: Path) -> None:
+        """Probe the files. Raises InputError for what is no video, and for videos of several sizes."""
+        self.path, self.files = path, video_files(path)
+        found = {str(file): probe_video(file) for file in self.files}
+        _require_one_size(path, {name: (i.width, i.height) for name, i in found.items()}, "videos")
+        self.width, self.height = next((i.width, i.height) for i in found.values())
+        self.expected_frames = sum(i.frame_count_claimed for i in found.values())
+
+    @cached_property
+    def digest(self) -> str:
+        """Do as `Recording` says."""
+        if self.files == (self.path,):
+            return known_sha256(self.path)
+        return files_sha256(((str(i), f) for i, f in enumerate(self.files)), of_file=known_sha256)
+
+    def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
+        """Do as `Recording` says; a truncated or damaged file is reported at its end."""
+        first, start = 0, 0.0
+        for file in self.files:
+            with VideoReader(file, None if wanted is None else lambda i, n=first: n + i in wanted) as reader:  # type: ignore[misc]
+                for index, time, rgb in reader:
+                    _require_size(rgb, self.width, self.height, f"frame {index} of {file}")
+                    yield VideoFrame(first + index, start + time, rgb)
+                if warn is not None:
+                    warn_of_video(file, reader, warn)
+                first, start = first + len(reader.timestamps), start + reader.timestamps[-1] + _PAUSE
+
+    def name(self, frame_id: int, index: int) -> str:
+        """Return 000000.jpg, 000001.jpg, ..."""
+        return f"{frame_id:06d}.jpg"
+
+
+def is_of_source(path: Path, run: RunFolder) -> bool:
+    """Return whether something that exists is a video that a run was made from, its folder of images, or in that."""
+    if (manifest := run.manifest()) is None or not path.exists():
+        return False
+    source = Path(manifest.source.path)
+    files = video_files(source) if source.is_file() else (source,)
+    return any(path.resolve().is_relative_to(file.resolve()) for file in files)
+
+
+# images -----------------------------------------------------------------------------------------------------------
+
+
+class ImageRecording(Recording):
+    """Images of one size; `headers` are those of the images that can be read."""
 
     def __init__(self, sequence: Sequence) -> None:
         """Read the headers. Raises InputError where they are not of one camera."""
         self.sequence = s = sequence
-        self.path, self.expected_frames, self.has_times = s.root, len(s), s.timestamps is not None
+        self.path, self.expected_frames = s.root, len(s)
         self._names = written_names(s.names, s.root)
         self.headers, self._common = Headers({}), None
         if not s.image_paths:
@@ -67,6 +223,10 @@ class ImageSource:
         self._common = self._orientation()
         self._require_one_camera()
         self.width, self.height = self._size(next(iter(self.headers.of.values())))
+
+    def is_timed(self) -> bool:
+        """Do as `Recording` says."""
+        return self.sequence.timestamps is not None
 
     def _of_one_size(self, headers: Headers) -> Headers:
         """The headers without those of images that are to be left out for their size."""
@@ -89,8 +249,8 @@ class ImageSource:
         return Reading(self._common, common_span(self.headers, images))
 
     def read(self, wanted: Container[int] | None = None, warn: Warn | None = None) -> Iterator[VideoFrame]:
-        """Decode from start to end, and hand out the wanted images (None = all) one at a time; those that cannot be
-        read are left out and reported to `warn`, as is what the headers and the reader of a data set note."""
+        """Do as `Recording` says; images that cannot be read are left out and reported, as is what the headers and the
+        reader of a data set note."""
         if warn is not None:
             self.headers.warn(warn)
             for note in self.sequence.notes:
@@ -105,32 +265,36 @@ class ImageSource:
                 if warn is not None:
                     warn(f"left out: {error}")
                 continue
-            require_size(rgb, self.width, self.height, f"{self.sequence.names[index]} of {self.path}")
-            yield VideoFrame(index, float(index if times is None else times[index]), rgb)
+            _require_size(rgb, self.width, self.height, f"{self.sequence.names[index]} of {self.path}")
+            yield VideoFrame(index, math.nan if times is None else float(times[index]), rgb)
 
     def name(self, frame_id: int, index: int) -> str:
-        """The image's own name; formats that are not written here become .png."""
+        """Return the image's own name; formats that are not written here become .png."""
         return self._names[index]
 
     def place(self, index: int) -> str:
-        """Return the path by which other programs may name image `index`, its name where it is no file."""
+        """Do as `Recording` says."""
         paths = self.sequence.image_paths
         return str(paths[index]) if paths else self.sequence.names[index]
 
+    def masks(self) -> dict[int, Path]:
+        """Do as `Recording` says."""
+        return {i: path for i, path in enumerate(self.sequence.mask_paths) if path is not None}
+
     def original(self, index: int) -> Path | None:
-        """The image's file, unless other programs would see it turned, transparent or not at all."""
+        """Do as `Recording` says."""
         path = self.sequence.image_paths[index] if self.sequence.image_paths else None
         if path is None or path.suffix.lower() not in WRITTEN_SUFFIXES or not is_plain(path):
             return None
         return path if self.reading.orientation in (None, 1) else None
 
     def transparent(self, index: int) -> NDArray[np.bool_] | None:
-        """(height, width) pixels of image `index` that its alpha channel makes transparent; None without any."""
+        """Do as `Recording` says."""
         paths = self.sequence.image_paths
         return read_transparent(paths[index], self.reading) if paths else None
 
     def exif_focal(self) -> float | None:
-        """Return the focal length in pixels that the images state, if any do."""
+        """Do as `Recording` says."""
         return self.headers.focal_px(self.width, self.height)
 
     def _rgb(self, index: int) -> NDArray[np.uint8]:
@@ -138,8 +302,55 @@ class ImageSource:
         return read_rgb(paths[index], self.reading) if paths else self.sequence.rgb(index)
 
 
-class RecordingSource(ImageSource):
-    """The frames of a data set. Where the recording has depth or labels is no matter here."""
+class FolderRecording(ImageRecording):
+    """The images directly in a folder, in natural order of their names; depth maps among them, and a few of another
+    size than the rest, are left out."""
+
+    def __init__(self, path: Path) -> None:
+        """See `ImageRecording`."""
+        listed = list_images(path)
+        images = _without_depth_maps(listed)
+        names, notes = tuple(image.name for image in images), _notes_on_unread(path)
+        if len(images) < len(listed):
+            notes += (f"{len(listed) - len(images)} depth maps among the images are left out",)
+        super().__init__(Sequence("images", path, names, read_image_times(images), tuple(images), notes=notes))
+
+    @cached_property
+    def digest(self) -> str:
+        """Do as `Recording` says."""
+        files = [*list_images(self.path), *filter(None, [times_file(self.path)])]
+        return files_sha256(sorted((p.name, p) for p in files), of_file=known_sha256)
+
+    def _of_one_size(self, headers: Headers) -> Headers:
+        headers = headers.of_most(lambda header: (min(header.stored), max(header.stored)))
+        common = headers.common_orientation()
+        return headers if common is not None else headers.of_most(lambda header: header.size)
+
+    def _require_one_camera(self) -> None:
+        sizes = {name: self._size(header) for name, header in self.headers.of.items()}
+        _require_one_size(self.path, sizes, "images")
+        super()._require_one_camera()
+
+    def turns_from_upright(self, index: int) -> int:
+        """Do as `Recording` says."""
+        return self.headers.turns_from_upright(self.sequence.names[index], self._common)
+
+    def file(self, index: int) -> Path:
+        """The image of that number, however it is turned."""
+        return self.sequence.image_paths[index]
+
+
+class DatasetRecording(ImageRecording):
+    """The frames of a data set."""
+
+    @cached_property
+    def digest(self) -> str:
+        """Do as `Recording` says."""
+        s = self.sequence
+        if not s.image_paths:
+            return known_sha256(self.path)
+        head = f"{s.format} {s.camera}".encode() + (b"" if s.timestamps is None else s.timestamps.tobytes())
+        return files_sha256(zip(s.names, s.image_paths, strict=True), head, known_sha256)
 
     def _orientation(self) -> int | None:
         common, camera = super()._orientation(), self.sequence.camera
@@ -152,24 +363,36 @@ class RecordingSource(ImageSource):
         if self.sequence.camera is None:
             super()._require_one_camera()
 
-    def known_camera(self) -> Camera | None:
-        """The data set's camera at the size of its images."""
+    def camera(self) -> Camera | None:
+        """Do as `Recording` says."""
         camera = self.sequence.camera
         return None if camera is None else camera.resized(self.width, self.height)
 
-
-def require_size(rgb: NDArray[np.uint8], width: int, height: int, what: str) -> None:
-    """Raise InputError for an image of another size than those before it."""
-    if rgb.shape[:2] != (height, width):
-        raise InputError(
-            f"{what} is {rgb.shape[1]}x{rgb.shape[0]}, the images before it are {width}x{height}: convert the source "
-            "to one size first"
-        )
+    def dataset(self) -> Sequence:
+        """Do as `Recording` says."""
+        return self.sequence
 
 
 def _is_shape_of(size: tuple[int, int], camera: Camera) -> bool:
     """Whether images of the size (width, height) are wide or high as the camera's are."""
     return camera.width != camera.height and (size[0] > size[1]) == (camera.width > camera.height)
+
+
+def _without_depth_maps(images: list[Path]) -> list[Path]:
+    """All but images of 16 bits in one channel, if there are others: some data sets keep depth beside colour."""
+    depth = {path for path in images if path.suffix.lower() in (".png", ".tif", ".tiff") and is_depth_map(path)}
+    return images if len(depth) == len(images) else [path for path in images if path not in depth]
+
+
+def _notes_on_unread(folder: Path) -> tuple[str, ...]:
+    unread = unread_images(folder)
+    if not unread:
+        return ()
+    kinds = ", ".join(sorted({path.suffix.lower() for path in unread}))
+    return (
+        f"{len(unread)} files of a format that is not read ({kinds}) are left out, {unread[0].name} first: export them "
+        "as JPEG or PNG",
+    )
 
 
 def written_name(name: str) -> str:
@@ -198,164 +421,24 @@ def written_names(names: Iterable[str], root: Path) -> tuple[str, ...]:
     return tuple(written)
 
 
-@dataclass(frozen=True)
-class Headers:
-    """Headers of the images that can be read, by name; the sizes (width, height) of those that are left out, as most
-    are of another."""
-
-    of: Mapping[str, Header]
-    odd: Mapping[str, Size] = field(default_factory=dict)
-
-    def of_most(self, size: Callable[[Header], Size]) -> Headers:
-        """Leave out the images of another size than `_MOST` of them have; none where fewer agree."""
-        common, count = Counter(size(header) for header in self.of.values()).most_common(1)[0]
-        if count < _MOST * len(self.of):
-            return self
-        odd = {name: header.size for name, header in self.of.items() if size(header) != common}
-        return replace(self, of={n: h for n, h in self.of.items() if n not in odd}, odd={**self.odd, **odd})
-
-    def focal_px(self, width: int, height: int) -> float | None:
-        """Median focal length, in pixels of an image of width x height, of the images that state one in EXIF."""
-        lenses = [header.lens for header in self.of.values()]
-        some = [lens for lens in lenses if lens.equivalent] or lenses
-        known = [focal for lens in some if (focal := lens.focal_px(width, height)) is not None]
-        return float(np.median(known)) if known else None
-
-    def common_orientation(self) -> int | None:
-        """Return the EXIF orientation by which all images are turned, the commonest, where turning each by its own
-        would make two sizes of one; None where each is turned by its own.
-
-        A phone that is turned between two photos is one camera only as its sensor lies.
-        """
-        found = Counter(h.orientation for h in self.of.values())
-        differ = len({h.size for h in self.of.values()}) > 1 and len({h.stored for h in self.of.values()}) == 1
-        if not differ or not set(found) <= set(QUARTER_TURNS):
-            return None
-        return min(found, key=lambda o: (-found[o], o))
-
-    def turns_from_upright(self, name: str, common: int | None) -> int:
-        """Return the anticlockwise quarter turns by which an image that is turned as all are differs from upright."""
-        if common is None or name not in self.of:
-            return 0
-        return (QUARTER_TURNS[common] - QUARTER_TURNS[self.of[name].orientation]) % 4
-
-    def warn(self, warn: Callable[[str], None]) -> None:
-        """Report images of several makes or models, which are treated as one camera, files of several images, unusable
-        colour profiles, and images left out for their size."""
-        if self.odd:
-            width, height = next(iter(self.of.values())).size
-            warn(
-                f"{len(self.odd)} of {len(self.odd) + len(self.of)} images are left out, as their size is not "
-                f"{width}x{height}: {_first(f'{n} ({w}x{h})' for n, (w, h) in self.odd.items())}"
-            )
-        if unusable := [name for name, h in self.of.items() if h.colours == UNUSABLE]:
-            warn(
-                f"the colour profile of {len(unusable)} images is damaged, or of another kind of colours; they are "
-                f"taken for sRGB: {_first(unusable)}"
-            )
-        several = [f"{name} ({h.images})" for name, h in self.of.items() if h.images > 1]
-        if several:
-            warn(
-                f"{len(several)} files hold several images, of which the first is used: {several[0]}"
-                f"{', …' if len(several) > 1 else ''}"
-            )
-        if self.common_orientation() is not None:
-            warn(
-                "some images were taken upright and some sideways, by their EXIF: all are turned as most of them are, "
-                "so that they are of one camera"
-            )
-        cameras = Counter(h.lens.camera for h in self.of.values() if h.lens.camera).most_common()
-        if len(cameras) > 1:
-            told = ", ".join(f"{count} by {name}" for name, count in cameras[:_MAX_NAMED])
-            warn(
-                f"by their EXIF the images were taken with {len(cameras)} cameras ({told}), which are treated as one: "
-                "if their lenses differ, keep the images of one camera together"
-            )
+# sizes and warnings -----------------------------------------------------------------------------------------------
 
 
-def _first(names: Iterable[str]) -> str:
-    some = list(itertools.islice(names, _MAX_NAMED + 1))
-    return ", ".join(some[:_MAX_NAMED]) + (", …" if len(some) > _MAX_NAMED else "")
+def _require_size(rgb: NDArray[np.uint8], width: int, height: int, what: str) -> None:
+    if rgb.shape[:2] != (height, width):
+        raise InputError(
+            f"{what} is {rgb.shape[1]}x{rgb.shape[0]}, the images before it are {width}x{height}: convert the source "
+            "to one size first"
+        )
 
 
-def read_headers(folder: Path, images: Mapping[str, Path]) -> Headers:
-    """Headers of these images of a folder. Raises InputError where none of them can be read."""
-    found: dict[str, Header] = {}
-    reason = ""
-    for name, path in images.items():
-        try:
-            found[name] = read_header(path)
-        except InputError as error:
-            reason = reason or str(error)
-    if not found:
-        raise InputError(f"none of the {len(images)} images of {folder} can be read: {reason}")
-    return Headers(found)
-
-
-def common_span(headers: Headers, images: Mapping[str, Path]) -> tuple[float, float] | None:
-    """Values that become black and white in all images of more than 8 bits; None where they use most of 16 bits.
-
-    From a half to 99.5 % of the pixels of evenly chosen images: grey of 10 to 14 bits, or of a thermal camera, fills a
-    small part of the range, of which 8 bits would keep a few levels.
-    """
-    deep = [name for name, header in headers.of.items() if header.is_deep]
-    chosen = deep[:: -(-len(deep) // _SAMPLED_IMAGES)] if deep else []
-    found = []
-    for name in chosen:
-        try:
-            values = read_deep(images[name])
-        except InputError:
-            continue  # left out with its reason when it is read
-        if values is not None:
-            some = values[::_SAMPLED_STEP, ::_SAMPLED_STEP].ravel()
-            found.append(some[np.isfinite(some)].astype(np.float64))
-    sample = np.concatenate(found) if found else np.zeros(0)
-    if not sample.size:
-        return None
-    low, high = (float(v) for v in np.percentile(sample, _SPAN_PERCENTILES))
-    is_whole = sample.min() >= 0 and sample.max() <= _LARGEST_16_BIT and high - low >= _LARGEST_16_BIT / 2
-    return None if is_whole or high <= low else (low, high)
-
-
-def require_one_lens(folder: Path, headers: Headers) -> None:
-    """Raise InputError where EXIF states several focal lengths, or crops, of images of one size.
-
-    What each image says in the same way is compared: 35 mm equivalents, else the focal length by pixel pitch, else
-    that in mm of one model of camera. Programs disagree on whether digital zoom is in the equivalent, so it is compared
-    among images of the same focal length in mm.
-    """
-    lenses = {name: header.lens for name, header in headers.of.items()}
-    _require_alike(folder, lenses, lambda e: e.equivalent, "a focal length of {:.3g} mm (35 mm equivalent)")
-    rest = {n: e for n, e in lenses.items() if not e.equivalent}
-    _require_alike(folder, rest, lambda e: e.by_pitch, "a focal length of {:.3g} mm (35 mm equivalent)")
-    rest = {n: e for n, e in rest.items() if not e.by_pitch}
-    for camera in {e.camera for e in rest.values()}:
-        same = {n: e for n, e in rest.items() if e.camera == camera}
-        _require_alike(folder, same, lambda e: e.focal_mm, "a focal length of {:.3g} mm")
-    for focal in {e.focal_mm for e in lenses.values()}:
-        same = {n: e for n, e in lenses.items() if e.focal_mm == focal}
-        _require_alike(folder, same, lambda e: e.zoom, "a digital zoom of {:.3g}")
-
-
-def _require_alike(folder: Path, lenses: Mapping[str, ExifLens], key: _Key, what: str) -> None:
-    values = {name: value for name, lens in lenses.items() if (value := key(lens))}
-    groups: list[list[str]] = []
-    for name in sorted(values, key=lambda n: values[n]):
-        if not groups or values[name] > _ALIKE * values[groups[-1][0]]:
-            groups.append([])
-        groups[-1].append(name)
-    if len(groups) < 2:
-        return
-    told = [_told(group, values, what) for group in sorted(groups, key=len, reverse=True)[:_MAX_NAMED]]
-    more = f"; and {len(groups) - _MAX_NAMED} more" if len(groups) > _MAX_NAMED else ""
-    raise InputError(
-        f"by their EXIF the images of {folder} were taken with {len(groups)} lenses or zooms: {'; '.join(told)}{more}. "
-        "Keep the images of one lens and zoom together. If the EXIF is wrong, remove it from the images"
-    )
-
-
-def _told(group: list[str], values: Mapping[str, float], what: str) -> str:
-    """A group of images in words: how many, with which value, and the first of them."""
-    first = [name for name in values if name in group][:2]
-    value = what.format(float(np.median([values[name] for name in group])))
-    return f"{len(group)} with {value} ({', '.join(first)}{', …' if len(group) > len(first) else ''})"
+def _require_one_size(folder: Path, sizes: dict[str, tuple[int, int]], what: str) -> None:
+    first_name, first = next(iter(sizes.items()))
+    others = [name for name, size in sizes.items() if size != first]
+    if others:
+        width, height = sizes[others[0]]
+        raise InputError(
+            f"the {what} of {folder} differ in size: {first_name} is {first[0]}x{first[1]}, {others[0]} is "
+            f"{width}x{height} ({len(others)} of {len(sizes)} differ from the first): keep the {what} of one camera "
+            "and one orientation together"
+        )

@@ -54,12 +54,15 @@ def sharpest_of_windows(
     One pass that holds one image. Windows lie on the source's clock from its first image, so a variable frame
     rate gives an even rate of frames.
     """
+    if rate <= 0:
+        yield from ((picture, measure(picture.rgb)) for picture in pictures)
+        return
     best: tuple[VideoFrame, float] | None = None
     window, start = 0, None
     for picture in pictures:
         start = picture.timestamp if start is None else start
         here = int((picture.timestamp - start + _TIME_SLACK) * rate)
-        if best is not None and (rate <= 0 or here != window):
+        if best is not None and here != window:
             yield best
             best = None
         window = here

@@ -21,9 +21,9 @@ from ..run.manifest import Manifest, Source, write_manifest
 from ..sfm.adjust import FEATURE_SD
 from ..sfm.lens import Lens, calibrated_camera, make_lens, to_pycolmap
 from ..source.given import read_intrinsics
-from ..source.opening import VideoSource, open_source, require_different, source_digest, video_files
-from ..source.recording import RecordingSource
+from ..source.recording import DatasetRecording, VideoRecording, open_recording
 from ..source.sharpness import reduce_image
+from ..source.videos import require_different, video_files
 from ..system.progress import Progress
 from ..system.wording import quoted
 from ..types import Features
@@ -88,7 +88,7 @@ def add_videos(run: RunFolder, videos: Sequence[Path], config: Config) -> Source
     save_parent(run, folder)
     path = folder / SOURCE_LIST
     write_text(path, "".join(f"{file}\n" for file in [*files, *(v.resolve() for v in videos)]))
-    source = Source(str(path.resolve()), source_digest(path, config.run.format))
+    source = Source(str(path.resolve()), open_recording(path, config.run.format).digest)
     write_manifest(run.manifest_file, Manifest(source, {}))
     for old in earlier:
         shutil.rmtree(old, ignore_errors=True)
@@ -96,7 +96,7 @@ def add_videos(run: RunFolder, videos: Sequence[Path], config: Config) -> Source
 
 
 def _require_plain_videos(run: RunFolder, source: Path, config: Config) -> None:
-    is_set = source.is_dir() or isinstance(open_source(source, config.run.format), RecordingSource)
+    is_set = source.is_dir() or isinstance(open_recording(source, config.run.format), DatasetRecording)
     if not (is_set or config.frames.poses):
         return
     why = "with --poses" if config.frames.poses else f"from {source}, no video"
@@ -172,7 +172,7 @@ def _features_of(video: Path, settings: FramesConfig, lens: Lens) -> Iterator[Fe
 
 
 def _samples(video: Path) -> Iterator[VideoFrame]:
-    source = VideoSource(video)
+    source = VideoRecording(video)
     count = max(source.expected_frames, _SAMPLES)
     return source.read(set(np.linspace(0, count - 1, _SAMPLES).round().astype(int).tolist()))
 

@@ -27,7 +27,7 @@ from ..outcome import Outcome, load_outcome
 from ..run.folder import RunFolder
 from ..run.target import Target
 from ..scene.world import WORLD, up_in_run
-from ..source.opening import is_of_source
+from ..source.recording import is_of_source
 from ..system.progress import Progress, SilentProgress, log
 from ..system.wording import quoted
 from ..types import Intrinsics

@@ -23,7 +23,7 @@ from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder, load_source
 from msgs_slam.pipelines.scene.gps import georeference
 from msgs_slam.pipelines.scene.world import WORLD
-from msgs_slam.pipelines.source.opening import FolderSource, open_source
+from msgs_slam.pipelines.source.recording import FolderRecording, open_recording
 
 Array = NDArray[np.float64]
 WRONG, OFF = 12, np.array([500.0, 0, 0])
@@ -98,8 +98,8 @@ def main() -> None:
     outcome, world = load_outcome(run), run.find(WORLD)
     if world is None or world.earth is None:
         sys.exit(f"{run.root}: its export has no place on the Earth")
-    source = open_source(Path(load_source(run).path), outcome.config.run.format)
-    assert isinstance(source, FolderSource)
+    source = open_recording(Path(load_source(run).path), outcome.config.run.format)
+    assert isinstance(source, FolderRecording)
     posed = outcome.trajectory.is_posed
     frames = [f for f, has in zip(outcome.frames, posed, strict=True) if has]
     names = [f.name for f in frames]

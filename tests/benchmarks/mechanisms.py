@@ -37,7 +37,7 @@ from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.sfm import candidates
 from msgs_slam.pipelines.sfm import driver as sfm
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
-from msgs_slam.pipelines.source.opening import open_source
+from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 SMALL = ("replica", "kitchen", "whiteroom", "fr1_rpy", "house_portrait", "corridor", "office_loop", "bedroom")
@@ -109,7 +109,7 @@ def begun(case: Case, source: Path, folder: Path) -> tuple[sfm.StructureFromMoti
     """Structure from motion of a source, its frames and keyframes; pictures, features and matches stay in `folder`."""
     config = load_config(overrides=["run.threads=1", *case.settings])
     context = StageContext(RunFolder(folder / "no.msgs"), source, config, folder, SilentProgress())
-    opened = open_source(source, config.run.format)
+    opened = open_recording(source, config.run.format)
     camera, origin = tasks.known_camera(context, opened, None)
     frames = pick_frames(context, opened, None)
     masks = tasks.masks_of(context, opened, None, ONE_CAMERA)

@@ -16,7 +16,7 @@ from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_source
 from msgs_slam.pipelines.run.lock import locked
 from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
-from msgs_slam.pipelines.source.opening import source_digest
+from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.viewer.scene import load_scenes
 from tests.cli.test_models_commands import write_network
 from tests.pipelines.finished import note_finished
@@ -184,7 +184,7 @@ def test_another_format_is_not_called_another_source(finished_run: FinishedRun, 
     run = RunFolder(tmp_path / "run.msgs")
     run.stage("frames").mkdir(parents=True)
     note_finished(run, ["frames"])
-    source = Source(str(finished_run.truth), source_digest(finished_run.truth, "auto"))
+    source = Source(str(finished_run.truth), open_recording(finished_run.truth, "auto").digest)
     write_manifest(run.manifest_file, Manifest(source, load_records(run)))
     before = contents(run.root)
     refused = " ".join(invoke("resume", run.root, "--set", "run.format=images").stderr.split())

@@ -66,7 +66,7 @@ from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.networks.words import load_linear_head, load_word_head, open_tokenizer, with_words
 from msgs_slam.pipelines.source.given import read_intrinsics
-from msgs_slam.pipelines.source.opening import open_source
+from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.viewer.scene import load_scenes
 from tests.clouds import random_cloud
 from tests.colmap_models import posed_images
@@ -180,7 +180,7 @@ def read_any(path: Path, *readers: Callable[[Path], Any]) -> None:
 
 
 def source(path: Path) -> None:
-    opened = open_source(path)
+    opened = open_recording(path)
     for frame in opened.read(warn=lambda text: None):
         need(frame.rgb.shape == (opened.height, opened.width, 3), "a frame of another size")
         opened.original(frame.source_index)
@@ -229,7 +229,7 @@ def judge_frame(recording: Sequence, index: int) -> None:
 
 
 def masks(folder: Path) -> None:
-    opened = open_masks(folder / "masks", open_source(folder / "rgb"))
+    opened = open_masks(folder / "masks", open_recording(folder / "rgb"))
     for index in range(2):
         opened.left_out(index, WIDTH, HEIGHT)
 

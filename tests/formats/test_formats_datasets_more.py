@@ -19,7 +19,7 @@ from msgs_slam.formats.datasets.colmap import camera_from_colmap
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
 from msgs_slam.formats.poses import read_poses
-from msgs_slam.pipelines.source.recording import RecordingSource
+from msgs_slam.pipelines.source.recording import DatasetRecording
 from tests.colmap_models import posed_images
 from tests.matrices import random_poses, write_matrices
 
@@ -355,8 +355,8 @@ def test_colmap_images_that_were_reduced(tmp_path: Path, known: Known) -> None:
     for i, path in enumerate(sorted((tmp_path / "images").iterdir())):
         write_rgb(tmp_path / "images_4" / path.name, known.rgb[i][::4, ::4])
         path.unlink()
-    source = RecordingSource(open_sequence(tmp_path))
-    assert source.known_camera() == Camera(WIDTH // 4, HEIGHT // 4, 12.5, 12.75, 8.125, 6)
+    source = DatasetRecording(open_sequence(tmp_path))
+    assert source.camera() == Camera(WIDTH // 4, HEIGHT // 4, 12.5, 12.75, 8.125, 6)
 
 
 def test_colmap_text_with_blanks_in_names_and_without_points(tmp_path: Path, known: Known) -> None:

@@ -33,7 +33,7 @@ from msgs_slam.formats.images import (
     write_grey_png,
     write_rgb,
 )
-from msgs_slam.pipelines.source.opening import open_source
+from msgs_slam.pipelines.source.recording import open_recording
 
 register_heif_opener()  # to write HEIC, which the program only reads
 
@@ -529,7 +529,7 @@ def test_an_unusable_profile_changes_nothing_and_is_named(tmp_path: Path, patche
     assert read_header(tmp_path / "1.png").colours == UNUSABLE
     assert not is_plain(tmp_path / "1.png")
     said: list[str] = []
-    assert len(list(open_source(tmp_path).read(warn=said.append))) == 3
+    assert len(list(open_recording(tmp_path).read(warn=said.append))) == 3
     (only,) = said
     assert "colour profile of 2 images is damaged" in only
     assert only.endswith("taken for sRGB: 1.png, 2.png")
@@ -560,6 +560,6 @@ def test_images_that_are_not_read_are_named(tmp_path: Path, picture: np.ndarray)
         write_rgb(tmp_path / f"{i}.jpg", picture)
         (tmp_path / f"more{i}.jxl").write_bytes(b"\xff\x0a")
     said: list[str] = []
-    assert len(list(open_source(tmp_path).read(warn=said.append))) == 3
+    assert len(list(open_recording(tmp_path).read(warn=said.append))) == 3
     assert len(said) == 1
     assert "3 files of a format that is not read (.jxl) are left out, more0.jxl first" in said[0]

@@ -13,7 +13,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.video import VideoReader, pixel_aspect, probe_video
 from msgs_slam.formats.video_head import Track, main_track, read_moov, read_tracks, video_sphere
 from msgs_slam.formats.video_streams import AvCapture
-from msgs_slam.pipelines.source.opening import VideoSource
+from msgs_slam.pipelines.source.recording import VideoRecording
 from tests.formats.test_formats_video import encode, hdr_signal, textured, with_matrix, woven, write_hdr
 
 INTERLACED = [
@@ -88,7 +88,7 @@ def test_raw_streams_are_read_at_their_rate(tmp_path: Path, codec: str, containe
     assert read_moov(path) == b""
     assert video_sphere(path) == ""
     said: list[str] = []
-    frames = list(VideoSource(path).read(warn=said.append))
+    frames = list(VideoRecording(path).read(warn=said.append))
     np.testing.assert_allclose([f.timestamp for f in frames], np.arange(10) / 25, atol=1e-9)
     assert said == [f"a.{container} has no timestamps (a raw stream?): 25 frames a second are assumed"]
 
@@ -129,7 +129,7 @@ def test_pixels_become_square(tmp_path: Path, turn: tuple[int, ...] | None, size
         with_matrix(path, *turn)  # type: ignore[misc]
     info = probe_video(narrow)
     assert (info.width, info.height) == size
-    source = VideoSource(narrow)
+    source = VideoRecording(narrow)
     assert (source.width, source.height) == size
     said: list[str] = []
     seen, true = list(source.read(warn=said.append))[4].rgb, list(VideoReader(plain))[4].rgb
@@ -179,7 +179,7 @@ def test_mirrored_is_not_turned(tmp_path: Path, matrix: tuple[int, ...], way: ob
 
 def test_frames_of_one_colour_are_left_out(tmp_path: Path) -> None:
     frames = np.concatenate([np.zeros((5, 240, 320, 3), np.uint8), textured(8, 320, 240)])
-    source = VideoSource(encode(tmp_path / "a.mp4", frames))
+    source = VideoRecording(encode(tmp_path / "a.mp4", frames))
     said: list[str] = []
     assert [f.source_index for f in source.read(warn=said.append)] == list(range(5, 13))
     assert said == ["a.mp4: 5 frames of one flat colour (a fade, or damage) were left out"]
@@ -191,7 +191,7 @@ def test_all_of_one_colour_is_refused(tmp_path: Path, pyav: bool, monkeypatch: p
     if not pyav:
         monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"all 4 frames of .* are of one flat colour"):
-        VideoSource(path)
+        VideoRecording(path)
 
 
 def test_a_codec_that_opencv_lacks_is_read_or_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -268,7 +268,7 @@ def test_what_an_edit_list_hides_is_not_missing(tmp_path: Path) -> None:
     assert track.samples == 50
     assert track.shown == pytest.approx(30 / 50, abs=0.05)
     said: list[str] = []
-    source = VideoSource(trimmed)
+    source = VideoRecording(trimmed)
     assert abs(len(list(source.read(warn=said.append))) - 30) <= 2
     assert abs(source.expected_frames - 30) <= 2
     assert said == []
@@ -282,7 +282,7 @@ def test_a_trimmed_file_that_is_cut_off_is_truncated(tmp_path: Path) -> None:
     data[start + (end - start) * 7 // 10 : end - 4] = bytes(end - 4 - start - (end - start) * 7 // 10)
     trimmed.write_bytes(data)
     said: list[str] = []
-    assert 0 < len(list(VideoSource(trimmed).read(warn=said.append))) < 27
+    assert 0 < len(list(VideoRecording(trimmed).read(warn=said.append))) < 27
     assert any("is truncated: its header declares" in s for s in said), said
 
 
@@ -303,7 +303,7 @@ def test_joined_recordings_go_on_with_the_usual_step(tmp_path: Path, shift: floa
         parts.append((tmp_path / name).read_bytes())
     (tmp_path / "both.ts").write_bytes(b"".join(parts))
     said: list[str] = []
-    source = VideoSource(tmp_path / "both.ts")
+    source = VideoRecording(tmp_path / "both.ts")
     times = [f.timestamp for f in source.read(warn=said.append)]
     assert len(times) == 40
     np.testing.assert_allclose(times, np.arange(40) / 25, atol=1e-3)
@@ -352,13 +352,13 @@ def test_the_main_track_is_read_and_the_other_named(
 ) -> None:
     path = two_tracks(tmp_path / f"a{suffix}", [(64, 48), (96, 64)], default=1)
     said: list[str] = []
-    source = VideoSource(path)
+    source = VideoRecording(path)
     assert {f.rgb.shape for f in source.read(warn=said.append)} == {(64, 96, 3)}
     assert len(said) == 1
     assert "holds 2 video tracks: track 2 (96x64) is used, not track 1 (64x48)" in said[0]
     monkeypatch.setitem(sys.modules, "av", None)
     said.clear()
-    source = VideoSource(path)
+    source = VideoRecording(path)
     assert {f.rgb.shape for f in source.read(warn=said.append)} == {(48, 64, 3)}
     assert "track 1 (64x48) is used, not track 2 (96x64)" in said[0]
     assert "-map 0:v:1" in said[0]
@@ -387,7 +387,7 @@ def test_an_alpha_channel_is_named(tmp_path: Path, name: str, codec: str, form: 
             file.mux(stream.encode(frame))
         file.mux(stream.encode())
     said: list[str] = []
-    assert len(list(VideoSource(tmp_path / name).read(warn=said.append))) == 3
+    assert len(list(VideoRecording(tmp_path / name).read(warn=said.append))) == 3
     assert [s for s in said if "has an alpha channel, which is not read" in s and "--masks MASKS" in s] == said
     assert said
 

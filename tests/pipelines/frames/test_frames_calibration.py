@@ -17,7 +17,7 @@ from msgs_slam.pipelines.frames.inputs import frames_inputs
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.sfm.lens import distortion_of, make_lens, set_lens, to_pycolmap, unknown_camera
 from msgs_slam.pipelines.source.given import pose_inputs, read_intrinsics
-from msgs_slam.pipelines.source.opening import FolderSource
+from msgs_slam.pipelines.source.recording import FolderRecording
 from tests.pipelines.frames.conftest import Walk
 
 
@@ -379,7 +379,7 @@ def test_a_second_coefficient_changes_nothing_by_itself() -> None:
 def test_a_prior_focal_length_that_leaves_no_structure_is_dropped_before_the_images_are_blamed(
     bent_walk: Walk, make_context: Callable[..., StageContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(FolderSource, "exif_focal", lambda _: 9.2)
+    monkeypatch.setattr(FolderRecording, "exif_focal", lambda _: 9.2)
     context = make_context(bent_walk.folder)
     figures = run(context)
     assert figures["calibration"] == "self-calibrated"
@@ -393,7 +393,7 @@ def test_a_prior_focal_length_that_leaves_no_structure_is_dropped_before_the_ima
 def test_a_plausible_prior_focal_length_that_contradicts_the_images_is_dropped_and_said(
     bent_walk: Walk, make_context: Callable[..., StageContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(FolderSource, "exif_focal", lambda _: 0.3 * bent_walk.focal)
+    monkeypatch.setattr(FolderRecording, "exif_focal", lambda _: 0.3 * bent_walk.focal)
     context = make_context(bent_walk.folder)
     figures = run(context)
     assert figures["calibration"] == "self-calibrated"
@@ -404,7 +404,7 @@ def test_a_plausible_prior_focal_length_that_contradicts_the_images_is_dropped_a
 def test_a_prior_focal_length_that_the_images_agree_with_is_kept(
     bent_walk: Walk, make_context: Callable[..., StageContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(FolderSource, "exif_focal", lambda _: 1.03 * bent_walk.focal)
+    monkeypatch.setattr(FolderRecording, "exif_focal", lambda _: 1.03 * bent_walk.focal)
     context = make_context(bent_walk.folder)
     assert run(context)["calibration"] == "exif"
     assert not [w for w in context.warnings if "contradicts the images" in w]

@@ -19,7 +19,7 @@ from msgs_slam.pipelines.frames.inputs import check_frames
 from msgs_slam.pipelines.geometry.camera import CUBE, ONE_CAMERA, Rig, rig_of
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.source.faces import find_faces, fisheye_face, looks_like_panoramas, panorama_faces
-from msgs_slam.pipelines.source.opening import open_source
+from msgs_slam.pipelines.source.recording import open_recording
 
 WIDTH = 320
 XML = "<GSpherical:ProjectionType>{}</GSpherical:ProjectionType><GSpherical:StereoMode>{}</GSpherical:StereoMode>"
@@ -119,7 +119,7 @@ def test_a_fisheye_is_given_by_numbers_or_files(tmp_path: Path, text: str) -> No
         '{"model": "OPENCV_FISHEYE", "width": 320, "height": 240, "fx": 180, "fy": 180, "cx": 160, "cy": 120,'
         ' "k1": 0.03, "k2": -0.01, "k3": 0.002, "k4": 0}'
     )
-    source = open_source(_folder(tmp_path, 320, 240))
+    source = open_recording(_folder(tmp_path, 320, 240))
     numbers = text[0].isdigit()
     config = FramesConfig(intrinsics=text if numbers else str(tmp_path / text), camera="fisheye" if numbers else "auto")
     faces = find_faces(source, config)
@@ -128,7 +128,7 @@ def test_a_fisheye_is_given_by_numbers_or_files(tmp_path: Path, text: str) -> No
 
 
 def test_what_cannot_be_is_refused_before_the_work(tmp_path: Path) -> None:
-    source = open_source(_folder(tmp_path, 320, 160))
+    source = open_recording(_folder(tmp_path, 320, 160))
     assert find_faces(source, FramesConfig()) is None
     assert looks_like_panoramas(source, FramesConfig())
     assert not looks_like_panoramas(source, FramesConfig(camera="perspective"))
@@ -145,7 +145,7 @@ def test_photo_spheres_are_known_by_their_xmp(tmp_path: Path, said: str, kind: s
     xmp = f'<rdf:Description GPano:ProjectionType="{said}"/>'.encode() if said else b""
     Image.new("RGB", (320, 160)).save(tmp_path / "a.jpg", xmp=xmp)
     assert image_sphere(tmp_path / "a.jpg") == kind
-    source = open_source(tmp_path)
+    source = open_recording(tmp_path)
     if kind == PART:
         with pytest.raises(InputError, match="partial or stereo panorama"):
             find_faces(source, FramesConfig())

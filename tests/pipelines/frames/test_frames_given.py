@@ -24,7 +24,7 @@ from msgs_slam.pipelines.sfm.consistency import ModelReport
 from msgs_slam.pipelines.sfm.given import agreement, posed_model
 from msgs_slam.pipelines.sfm.lens import to_pycolmap, unknown_camera
 from msgs_slam.pipelines.source.given import given_poses
-from msgs_slam.pipelines.source.opening import open_source
+from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.types import Frame, GivenPoses
 from tests.colmap_models import posed_images
 from tests.pipelines.frames.made_views import structure_of, walk_round
@@ -160,7 +160,7 @@ def test_poses_named_by_frame_numbers_belong_to_a_videos_frames(tmp_path: Path) 
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     config, warnings = FramesConfig(poses=str(tmp_path)), []
     picked = [Frame(k, f"{k:06d}.jpg", i / 10, i, 0.0) for k, i in enumerate((1, 3, 6, 7))]
-    given = given_poses(config, open_source(video), picked, warnings.append)
+    given = given_poses(config, open_recording(video), picked, warnings.append)
     assert given is not None
     np.testing.assert_allclose(-given.cam_from_world[:, 0, 3], [1, 3, np.nan, 7])
     assert "1 of its poses are not finite" in "".join(warnings)
@@ -174,7 +174,7 @@ def test_poses_of_equal_names_belong_to_the_images_of_their_folders(tmp_path: Pa
         write_rgb(tmp_path / "images" / name.upper(), _ramp(9 * i))
     write_colmap_model(tmp_path / "sparse" / "0", posed_images(names, poses, 64, 48, 50.0, 50.0, 32.0, 24.0))
     for folder, expected in ((tmp_path, range(6)), (tmp_path / "images" / "CAM_B", range(3, 6))):
-        source = open_source(folder)
+        source = open_recording(folder)
         frames = [Frame(i, source.name(i, i), 0.0, i, 0.0) for i in range(len(expected))]
         given = given_poses(FramesConfig(poses=str(tmp_path)), source, frames)
         assert given is not None
@@ -186,7 +186,7 @@ def test_poses_of_one_number_twice_are_refused_for_a_video(tmp_path: Path) -> No
     rows = [f"{c}/{i}.jpg,0,0,0,0,0,0,1" for c in "ab" for i in range(4)]
     (tmp_path / "poses.csv").write_text("\n".join(["name,x,y,z,qx,qy,qz,qw", *rows]))
     with pytest.raises(InputError, match="two poses are of images with the number 0"):
-        given_poses(FramesConfig(poses=str(tmp_path / "poses.csv")), open_source(video), [])
+        given_poses(FramesConfig(poses=str(tmp_path / "poses.csv")), open_recording(video), [])
 
 
 KINECT = Camera(640, 480, 517.3, 516.5, 319.1, 255.8, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))

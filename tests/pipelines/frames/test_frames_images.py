@@ -12,7 +12,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
 from msgs_slam.pipelines.frames.masks import FrameMasks, open_masks
 from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.source.opening import open_source
+from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.types import Frame
 from tests.formats.test_formats_images import P3_IN_XYZ, icc_profile
 
@@ -53,7 +53,7 @@ def test_photos_of_a_phone_that_was_turned_are_all_turned_alike(
     orientations: tuple[int, ...], turns: int, suffix: str, tmp_path: Path
 ) -> None:
     sensor = _turned(tmp_path / "photos", *orientations, suffix=suffix)
-    source, notes = open_source(tmp_path / "photos"), []
+    source, notes = open_recording(tmp_path / "photos"), []
     frames = [frame.rgb for frame in source.read(warn=notes.append)]
     for frame, pixels in zip(frames, sensor, strict=True):
         assert frame.shape[:2] == (source.height, source.width)
@@ -67,7 +67,7 @@ def test_photos_of_a_phone_that_was_turned_are_all_turned_alike(
 
 def test_masks_of_turned_photos_lie_as_their_images(tmp_path: Path) -> None:
     _turned(tmp_path / "photos", 6, 6, 1)
-    source = open_source(tmp_path / "photos")
+    source = open_recording(tmp_path / "photos")
     upright = [np.zeros((64, 48), bool), np.zeros((64, 48), bool), np.zeros((48, 64), bool)]
     for i, mask in enumerate(upright):
         mask[:10] = True
@@ -81,7 +81,7 @@ def test_masks_of_turned_photos_lie_as_their_images(tmp_path: Path) -> None:
 def test_mirrored_photos_are_turned_each_by_its_own(tmp_path: Path) -> None:
     _turned(tmp_path / "photos", 1, 5)
     with pytest.raises(InputError, match="differ in size"):
-        open_source(tmp_path / "photos")
+        open_recording(tmp_path / "photos")
 
 
 @pytest.mark.parametrize("kind", ["12 bit grey", "thermal", "12 bit colour", "float with gaps"])
@@ -100,14 +100,14 @@ def test_deep_images_that_use_a_part_of_the_range_share_one_scale(kind: str, tmp
         else:
             start = 51000 if kind == "thermal" else 0
             Image.fromarray((start + values).astype(np.uint16)).save(tmp_path / f"{i}.png")
-    source = open_source(tmp_path)
+    source = open_recording(tmp_path)
     bright, dark = (frame.rgb for frame in source.read())
     assert len(np.unique(bright)) > 200
     assert bright[9].max() == 255
     assert 100 < dark[9].max() < 160
     if kind == "float with gaps":
         assert bright[0, :2, 0].tolist() == [0, 255]
-    assert [f.rgb.sum() for f in open_source(tmp_path).read()] == [bright.sum(), dark.sum()]
+    assert [f.rgb.sum() for f in open_recording(tmp_path).read()] == [bright.sum(), dark.sum()]
 
 
 def test_a_transparent_background_is_left_out_beside_the_masks(tmp_path: Path) -> None:
@@ -120,7 +120,7 @@ def test_a_transparent_background_is_left_out_beside_the_masks(tmp_path: Path) -
     given = np.zeros((48, 64), bool)
     given[:, :8] = True
     write_grey_png(tmp_path / "masks" / "1.png", np.where(given, 0, 255).astype(np.uint8))
-    source = open_source(tmp_path)
+    source = open_recording(tmp_path)
     config = load_config(overrides=[f"frames.masks={tmp_path / 'masks'}"])
     masks = FrameMasks(config, source, tmp_path / "people", tmp_path / "picked", 1)
     frames = [Frame(i, f"{i}.png", float(i), i, 1.0) for i in range(3)]
@@ -137,7 +137,7 @@ def test_files_of_several_pictures_and_several_cameras_are_told(tmp_path: Path) 
     pages = [Image.fromarray(_noise(i)) for i in range(3)]
     pages[0].save(tmp_path / "photos" / "3.tif", save_all=True, append_images=pages[1:])
     notes: list[str] = []
-    assert len(list(open_source(tmp_path / "photos").read(warn=notes.append))) == 4
+    assert len(list(open_recording(tmp_path / "photos").read(warn=notes.append))) == 4
     assert any("2 cameras (2 by Phone, 1 by Camera)" in note for note in notes)
     assert any("of which the first is used: 3.tif (3)" in note for note in notes)
 
@@ -156,7 +156,7 @@ def test_images_of_several_lenses_are_refused_by_their_groups(
     first: dict[int, object], second: dict[int, object], told: str, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match=told):
-        open_source(_photos(tmp_path / "photos", *4 * [first], *2 * [second]))
+        open_recording(_photos(tmp_path / "photos", *4 * [first], *2 * [second]))
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_images_of_several_lenses_are_refused_by_their_groups(
 def test_focal_lengths_that_agree_are_one_camera(
     lenses: tuple[dict[int, object], ...], equivalent: float | None, tmp_path: Path
 ) -> None:
-    source = open_source(_photos(tmp_path / "photos", *lenses))
+    source = open_recording(_photos(tmp_path / "photos", *lenses))
     wanted = None if equivalent is None else pytest.approx(equivalent / 43.2666 * 80, rel=1e-4)
     assert source.exif_focal() == wanted
 
@@ -187,14 +187,14 @@ def _sized(folder: Path, *sizes: tuple[int, int]) -> Path:
 
 def test_a_few_images_of_another_size_are_left_out_and_named(tmp_path: Path) -> None:
     """Also where it is the first one, and beside photos of a phone that was turned."""
-    source, said = open_source(_sized(tmp_path / "a", (64, 48), *[(48, 64)] * 9, (30, 40))), []
+    source, said = open_recording(_sized(tmp_path / "a", (64, 48), *[(48, 64)] * 9, (30, 40))), []
     assert (source.width, source.height) == (64, 48)
     assert [f.source_index for f in source.read(warn=said.append)] == list(range(1, 10))
     assert said == ["2 of 11 images are left out, as their size is not 64x48: 10.png (40x30), 0.png (48x64)"]
     _turned(tmp_path / "b", 6, 1, 6, 8, 6)
     Image.fromarray(_noise(0, (20, 20))).save(tmp_path / "b" / "9.png")
     said.clear()
-    source = open_source(tmp_path / "b")
+    source = open_recording(tmp_path / "b")
     assert [f.source_index for f in source.read(warn=said.append)] == list(range(5))
     assert any("1 of 6 images are left out" in s for s in said)
     assert any("some sideways" in s for s in said)
@@ -202,7 +202,7 @@ def test_a_few_images_of_another_size_are_left_out_and_named(tmp_path: Path) -> 
 
 def test_sizes_without_a_clear_majority_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"differ in size: 0\.png is 64x48, 3\.png is 48x64 \(1 of 4 differ"):
-        open_source(_sized(tmp_path / "a", *[(48, 64)] * 3, (64, 48)))
+        open_recording(_sized(tmp_path / "a", *[(48, 64)] * 3, (64, 48)))
 
 
 def test_images_with_a_profile_are_written_anew(tmp_path: Path) -> None:
@@ -210,5 +210,5 @@ def test_images_with_a_profile_are_written_anew(tmp_path: Path) -> None:
     profile = icc_profile(P3_IN_XYZ, 2.2)
     for i in range(3):
         Image.fromarray(_noise(i)).save(tmp_path / f"{i}.png", **({"icc_profile": profile} if i == 1 else {}))
-    source = open_source(tmp_path)
+    source = open_recording(tmp_path)
     assert [source.original(i) is not None for i in range(3)] == [True, False, True]

@@ -21,7 +21,7 @@ from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.run.files import SPARSE
 from msgs_slam.pipelines.sfm.driver import Structure
-from msgs_slam.pipelines.source.opening import open_source
+from msgs_slam.pipelines.source.recording import open_recording
 from tests.pipelines.frames.conftest import HEIGHT, WALK_FRAMES, WIDTH, Walk, bluish, render, sideways
 from tests.pipelines.frames.test_frames_stage import digests
 from tests.pipelines.proxy.tiny_tflite import blue_people
@@ -178,7 +178,7 @@ def _masked_data_set(folder: Path) -> None:
 
 def test_masks_of_a_data_set_are_used_and_those_of_the_user_win(tmp_path: Path) -> None:
     _masked_data_set(tmp_path)
-    source = open_source(tmp_path)
+    source = open_recording(tmp_path)
     found = masks_for(Config(), source).left_out(0, 64, 48)
     assert found is not None
     assert (found[:, :32].all(), found[:, 32:].any()) == (True, False)

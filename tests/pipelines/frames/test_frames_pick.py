@@ -14,8 +14,8 @@ from msgs_slam.formats.video import VideoFrame
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.keyframes import pick_frames
-from msgs_slam.pipelines.source.opening import open_source
 from msgs_slam.pipelines.source.overlap import Motion
+from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.source.sharpness import reduce_image, reduced_size, sharpest_of_windows, sharpness
 
 BLANK = np.zeros((2, 2, 3), np.uint8)
@@ -156,11 +156,11 @@ def test_a_time_lapse_is_kept_whole(tmp_path: Path, make_context: Callable[..., 
     path = tmp_path / "lapse.avi"
     write_video(path, [p.rgb for p in _filmed([20.0] * 23)], 30.0)
     context = make_context(path)
-    frames = pick_frames(context, open_source(path), None)
+    frames = pick_frames(context, open_recording(path), None)
     assert [f.source_index for f in frames] == [f.id for f in frames] == list(range(24))
     assert [f.timestamp for f in frames] == pytest.approx(np.arange(24) / 30, abs=1e-3)
     stored = sorted(p.name for p in (context.snapshot / "picked").iterdir())
     assert stored == [f.name for f in frames] == [f"{i:06d}.jpg" for i in range(24)]
     own = [read_rgb(context.snapshot / "picked" / name).astype(float) for name in stored]
     assert all(np.abs(a - p.rgb).mean() < 6 for a, p in zip(own, _filmed([20.0] * 23), strict=True))
-    assert pick_frames(context, open_source(path), None) == frames
+    assert pick_frames(context, open_recording(path), None) == frames

@@ -27,8 +27,7 @@ from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.sfm.lens import FramePixels, distortion_of, make_lens, to_pycolmap
-from msgs_slam.pipelines.source.opening import FolderSource, open_source
-from msgs_slam.pipelines.source.recording import RecordingSource
+from msgs_slam.pipelines.source.recording import DatasetRecording, FolderRecording, open_recording
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics
 from tests.pipelines.part_of_sequence import part_of
@@ -44,9 +43,9 @@ def short(truth: Sequence) -> Sequence:
 def test_each_layout_is_recognised_and_read(layout: str, short: Sequence, tmp_path: Path) -> None:
     write, format, timed, _, _ = LAYOUTS[layout]
     path = write(short, tmp_path / "set")
-    source = open_source(path)
-    assert isinstance(source, RecordingSource)
-    assert (source.sequence.format, source.expected_frames, source.has_times) == (format, 5, timed)
+    source = open_recording(path)
+    assert isinstance(source, DatasetRecording)
+    assert (source.sequence.format, source.expected_frames, source.is_timed()) == (format, 5, timed)
     frames = list(source.read())
     wanted = np.stack([short.rgb(i) for i in range(5)]).astype(float)
     if layout == "euroc":
@@ -56,17 +55,17 @@ def test_each_layout_is_recognised_and_read(layout: str, short: Sequence, tmp_pa
     if timed:
         gaps = 0.1 if layout in ("scannet", "seven_scenes") else np.diff(short.timestamps)
         np.testing.assert_allclose(np.diff([f.timestamp for f in frames]), gaps, atol=1e-5)
-    camera, true = source.known_camera(), short.camera
+    camera, true = source.camera(), short.camera
     assert camera is not None
     assert true is not None
     found, expected = ((c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (camera, true))
     np.testing.assert_allclose(found, expected, atol=1e-3)
     assert len({source.name(i, i) for i in range(5)}) == 5
-    assert open_source(path, format).expected_frames == 5
+    assert open_recording(path, format).expected_frames == 5
 
 
 def test_warnings_of_an_interrupted_attempt_are_given_once(short: Sequence, tmp_path: Path) -> None:
-    source = open_source(seven_scenes(short, tmp_path / "set"))
+    source = open_recording(seven_scenes(short, tmp_path / "set"))
     for _ in range(2):
         context = StageContext(RunFolder(tmp_path), source.path, Config(), tmp_path, SilentProgress())
         context.warn("looks like panoramas")  # by every attempt, before it picks
@@ -77,10 +76,10 @@ def test_warnings_of_an_interrupted_attempt_are_given_once(short: Sequence, tmp_
 def test_a_camera_of_a_file_is_fixed_and_one_of_the_kind_is_a_start(short: Sequence, tmp_path: Path) -> None:
     path = seven_scenes(short, tmp_path / "set")
     context = StageContext(RunFolder(tmp_path), path, Config(), tmp_path, SilentProgress())
-    camera, origin = known_camera(context, open_source(path), None)
+    camera, origin = known_camera(context, open_recording(path), None)
     assert (origin, camera.params.tolist()) == ("stated", pytest.approx([208, 208, 120, 90], abs=20))
     (path / "camera-intrinsics-color.txt").unlink()
-    camera, origin = known_camera(context, open_source(path), None)
+    camera, origin = known_camera(context, open_recording(path), None)
     assert (origin, camera.model.name, camera.has_prior_focal_length) == ("self-calibrated", "SIMPLE_RADIAL", True)
     assert camera.params.tolist() == [525 * 240 / 640, 120, 90, 0]
 
@@ -122,9 +121,9 @@ def test_depth_and_labels_of_the_set_are_the_oracle(layout: str, short: Sequence
 
 
 def surroundings(path: Path) -> ProviderContext:
-    source = open_source(path)
-    assert isinstance(source, RecordingSource)
-    camera = source.known_camera()
+    source = open_recording(path)
+    assert isinstance(source, DatasetRecording)
+    camera = source.camera()
     assert camera is not None
     k = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     frames = [Frame(i, source.name(i, i), 0.1 * i, i, 1.0) for i in range(source.expected_frames)]
@@ -156,17 +155,17 @@ def test_maps_follow_the_lens(distortion: tuple[float, ...]) -> None:
 
 def test_a_folder_of_images_is_no_data_set_by_what_lies_beside_it(short: Sequence, tmp_path: Path) -> None:
     path = LAYOUTS["semantic_nerf"][0](short, tmp_path / "set")
-    assert isinstance(open_source(path / "rgb"), FolderSource)
+    assert isinstance(open_recording(path / "rgb"), FolderRecording)
     seven = LAYOUTS["seven_scenes"][0](short, tmp_path / "seven")
-    assert isinstance(open_source(seven), RecordingSource)
-    assert isinstance(open_source(seven, "images"), FolderSource)
+    assert isinstance(open_recording(seven), DatasetRecording)
+    assert isinstance(open_recording(seven, "images"), FolderRecording)
     for i in range(5):
         write_rgb(tmp_path / "plain" / f"{i}.png", short.rgb(i))
     LAYOUTS["colmap"][0](short, tmp_path / "plain")
-    assert isinstance(open_source(tmp_path / "plain"), FolderSource)
-    assert isinstance(open_source(tmp_path / "plain", "colmap"), RecordingSource)
+    assert isinstance(open_recording(tmp_path / "plain"), FolderRecording)
+    assert isinstance(open_recording(tmp_path / "plain", "colmap"), DatasetRecording)
     with pytest.raises(InputError, match="did you mean 'scannet'"):
-        open_source(tmp_path / "plain", "scanet")
+        open_recording(tmp_path / "plain", "scanet")
 
 
 @pytest.mark.parametrize(
@@ -183,13 +182,13 @@ def test_pictures_beside_the_images_do_not_hide_a_project(
         (path / "images").rename(path / layout)
     for name in (*strays, "._0.jpg", ".DS_Store", "Thumbs.db"):
         Image.new("RGB", (20, 30)).save(path / name, "PNG")
-    source = open_source(path)
-    assert isinstance(source, RecordingSource)
+    source = open_recording(path)
+    assert isinstance(source, DatasetRecording)
     assert source.sequence.format == (layout if layout in ("colmap", "nerfstudio") else "folder")
     assert source.expected_frames == 5
     if source.sequence.format == "folder":
         assert f"the 5 images in {layout}/ are used, not the {len(strays)} in project/" in source.sequence.notes
-    assert isinstance(open_source(path, "images"), FolderSource)
+    assert isinstance(open_recording(path, "images"), FolderRecording)
 
 
 def test_a_damaged_first_image_does_not_cost_the_set(short: Sequence, tmp_path: Path) -> None:
@@ -198,13 +197,13 @@ def test_a_damaged_first_image_does_not_cost_the_set(short: Sequence, tmp_path: 
         first = open_sequence(path).image_paths[0]
         first.write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
         warnings: list[str] = []
-        source = open_source(path)
+        source = open_recording(path)
         assert (source.width, len(list(source.read(warn=warnings.append)))) == (240, 4), layout
         assert "git-LFS" in "".join(warnings)
 
 
 def test_times_stay_those_of_the_set(short: Sequence, tmp_path: Path) -> None:
-    source = open_source(tum(short, tmp_path / "set"))
+    source = open_recording(tum(short, tmp_path / "set"))
     assert next(iter(source.read())).timestamp == pytest.approx(START + short.timestamps[0], abs=1e-6)
 
 

@@ -17,10 +17,10 @@ from msgs_slam.formats.video_writer import write_video
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import places_figure, run
-from msgs_slam.pipelines.reconstruct import one_source, source_digest
+from msgs_slam.pipelines.reconstruct import one_source
 from msgs_slam.pipelines.run.folder import RunFolder, load_source
 from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
-from msgs_slam.pipelines.source.opening import FolderSource, VideoSource, open_source
+from msgs_slam.pipelines.source.recording import FolderRecording, VideoRecording, open_recording
 from msgs_slam.pipelines.types import Frame
 
 
@@ -53,18 +53,18 @@ def test_a_source_that_stays_the_same_is_read_once(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(reading, "file_sha256", lambda path: read.append(path.name) or right(path))
     for name in ("0.png", "1.png"):
         write_rgb(tmp_path / name, np.zeros((24, 32, 3), np.uint8))
-    before = source_digest(tmp_path, "auto")
-    assert source_digest(tmp_path, "auto") == before
+    before = open_recording(tmp_path, "auto").digest
+    assert open_recording(tmp_path, "auto").digest == before
     assert read == ["0.png", "1.png"]
     write_rgb(tmp_path / "1.png", np.ones((24, 32, 3), np.uint8))
-    assert source_digest(tmp_path, "auto") != before
+    assert open_recording(tmp_path, "auto").digest != before
     assert read == ["0.png", "1.png", "1.png"]
 
 
 def test_a_video_is_read_in_order_with_times(video: Path) -> None:
-    source = open_source(video)
-    assert isinstance(source, VideoSource)
-    assert (source.width, source.height, source.has_times) == (64, 48, True)
+    source = open_recording(video)
+    assert isinstance(source, VideoRecording)
+    assert (source.width, source.height, source.is_timed()) == (64, 48, True)
     frames = list(source.read())
     assert [f.source_index for f in frames] == list(range(20))
     np.testing.assert_allclose([f.timestamp for f in frames], np.arange(20) / 10, atol=1e-6)
@@ -76,10 +76,10 @@ def test_a_video_is_read_in_order_with_times(video: Path) -> None:
 def test_a_folder_keeps_names_and_natural_order(tmp_path: Path) -> None:
     for i in (10, 9, 2):
         write_rgb(tmp_path / f"img{i}.jpg", _noise(i))
-    source = open_source(tmp_path)
-    assert isinstance(source, FolderSource)
+    source = open_recording(tmp_path)
+    assert isinstance(source, FolderRecording)
     assert [source.name(k, k) for k in range(3)] == ["img2.jpg", "img9.jpg", "img10.jpg"]
-    assert not source.has_times
+    assert not source.is_timed()
     assert source.original(0) == tmp_path / "img2.jpg"
 
 
@@ -87,7 +87,7 @@ def test_depth_maps_beside_the_images_are_left_out(tmp_path: Path) -> None:
     for i in range(3):
         write_rgb(tmp_path / f"{i}.color.jpg", _noise(i))
         write_grey_png(tmp_path / f"{i}.depth.png", np.full((48, 64), 1000 + i, np.uint16))
-    source = open_source(tmp_path)
+    source = open_recording(tmp_path)
     assert [source.name(i, i) for i in range(source.expected_frames)] == ["0.color.jpg", "1.color.jpg", "2.color.jpg"]
 
 
@@ -95,8 +95,8 @@ def test_times_beside_the_images_are_used(tmp_path: Path) -> None:
     for i in range(3):
         write_rgb(tmp_path / f"{i}.png", _noise(i))
     (tmp_path / "timestamps.txt").write_text("5.0\n5.5\n7.25\n")
-    source = open_source(tmp_path)
-    assert source.has_times
+    source = open_recording(tmp_path)
+    assert source.is_timed()
     assert [f.timestamp for f in source.read()] == [5.0, 5.5, 7.25]
 
 
@@ -108,7 +108,7 @@ def test_images_that_others_would_see_differently_are_not_copied(tmp_path: Path)
     plain.save(tmp_path / "b.bmp")
     Image.fromarray(np.dstack([_noise(1), np.full((48, 64), 90, np.uint8)])).save(tmp_path / "c_clear.png")
     plain.save(tmp_path / "d.png")
-    source = open_source(tmp_path)
+    source = open_recording(tmp_path)
     assert [source.original(i) is not None for i in range(4)] == [False, False, False, True]
     assert source.name(1, 1) == "b.bmp.png"
 
@@ -118,18 +118,18 @@ def test_images_of_different_sizes_are_refused(sizes: tuple[tuple[int, int], ...
     for i, size in enumerate(sizes):
         write_rgb(tmp_path / f"{i}.png", _noise(i, size))
     with pytest.raises(InputError, match=r"differ in size: 0\.png is 64x48, 1\.png"):
-        open_source(tmp_path)
+        open_recording(tmp_path)
 
 
 def test_a_folder_of_damaged_images_is_refused(tmp_path: Path) -> None:
     for i in range(3):
         (tmp_path / f"{i}.jpg").write_bytes(b"\xff\xd8\xff damaged")
     with pytest.raises(InputError, match=r"none of the 3 images .* can be read: .*0\.jpg is damaged or no image"):
-        open_source(tmp_path)
+        open_recording(tmp_path)
     for i in range(3):
         (tmp_path / f"{i}.jpg").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 3\n")
     with pytest.raises(InputError, match=r"none of the 3 images .* git-LFS pointer.*git lfs pull"):
-        open_source(tmp_path)
+        open_recording(tmp_path)
 
 
 def test_one_image_is_refused(tmp_path: Path, make_context: Callable[..., StageContext]) -> None:
@@ -183,7 +183,7 @@ def test_odd_videos_are_refused(
 
 def test_a_truncated_video_is_read_to_its_end_with_a_warning(shared_data: Path) -> None:
     said: list[str] = []
-    source = open_source(shared_data / "odd_videos" / "d_odd_423x181_mjpeg.avi")
+    source = open_recording(shared_data / "odd_videos" / "d_odd_423x181_mjpeg.avi")
     frames = list(source.read(warn=said.append))
     assert len(frames) == 150
     assert (source.width, source.height) == (423, 181)
@@ -198,7 +198,7 @@ def test_videos_of_one_place_are_one_source(tmp_path: Path) -> None:
     ]
     run = RunFolder(tmp_path / "both.msgs")
     assert one_source(paths[:1], run) == paths[0]
-    source = open_source(one_source(paths, run))
+    source = open_recording(one_source(paths, run))
     frames = list(source.read())
     assert [f.source_index for f in frames] == [0, 1, 2, 3, 4]
     assert [round(float(f.rgb.mean()), -1) for f in frames] == [10, 40, 70, 130, 160]
@@ -207,18 +207,18 @@ def test_videos_of_one_place_are_one_source(tmp_path: Path) -> None:
     assert gaps[2] > 5
     assert [f.source_index for f in source.read({1, 4})] == [1, 4]
     assert {p.name for p in tmp_path.iterdir()} == {"a.avi", "b.avi", "both.msgs"}
-    digest = source_digest(run.root / "source.videos", "auto")
+    digest = open_recording(run.root / "source.videos", "auto").digest
     write_manifest(run.manifest_file, Manifest(Source(str(run.root / "source.videos"), digest), {}))
     moved = RunFolder(run.root.rename(tmp_path / "moved.msgs"))
     assert load_source(moved).path == str(moved.root / "source.videos")
     (tmp_path / "both.videos").write_text("b.avi\na.avi\n")
-    assert source_digest(tmp_path / "both.videos", "auto") != digest
+    assert open_recording(tmp_path / "both.videos", "auto").digest != digest
     write_video(tmp_path / "b.avi", [_shade(9, 80)] * 2, 10.0)
     with pytest.raises(InputError, match=r"videos of .*both.videos differ in size: .*b\.avi is 80x48, .*a\.avi"):
-        open_source(tmp_path / "both.videos")
+        open_recording(tmp_path / "both.videos")
     (tmp_path / "both.videos").write_text("both.videos\n")
     with pytest.raises(InputError, match="names no videos"):
-        open_source(tmp_path / "both.videos")
+        open_recording(tmp_path / "both.videos")
 
 
 def test_a_list_of_videos_never_enters_what_is_not_their_run(tmp_path: Path) -> None:
@@ -249,9 +249,9 @@ def test_archives_and_folders_of_folders_are_told_what_to_give(tmp_path: Path) -
     for kind in ("zip", "tar", "gztar", "xztar"):
         archive = shutil.make_archive(str(tmp_path / "scan"), kind, tmp_path / "scan")
         with pytest.raises(InputError, match="is an archive: unpack it first"):
-            open_source(Path(archive))
+            open_recording(Path(archive))
     with pytest.raises(InputError, match=r"no images in .*the folder photos/ in it holds 3 images: give that"):
-        open_source(tmp_path / "scan")
+        open_recording(tmp_path / "scan")
     write_rgb(tmp_path / "scan" / "cover.jpg", _noise(9))
     done = CliRunner().invoke(main, ["reconstruct", str(tmp_path / "scan"), "--out", str(tmp_path / "run"), "--quiet"])
     assert done.exit_code
@@ -262,7 +262,7 @@ def test_pointers_in_place_of_images_are_named(tmp_path: Path) -> None:
     for i in range(3):
         (tmp_path / f"{i}.JPG").write_text("version https://git-lfs.github.com/spec/v1\n")
     with pytest.raises(InputError, match=r"none of the 3 images.*0\.JPG is a git-LFS pointer"):
-        open_source(tmp_path)
+        open_recording(tmp_path)
 
 
 def write_photos(folder: Path, placed: int, count: int) -> Path:
@@ -279,6 +279,6 @@ def write_photos(folder: Path, placed: int, count: int) -> Path:
 
 def test_how_many_pictures_say_where_they_were_taken(tmp_path: Path) -> None:
     frames = [Frame(i, f"{i}.jpg", float(i), i, 1.0) for i in range(4)]
-    some, none = (open_source(write_photos(tmp_path / str(n), n, 4), "auto") for n in (3, 0))
+    some, none = (open_recording(write_photos(tmp_path / str(n), n, 4), "auto") for n in (3, 0))
     assert places_figure(some, frames) == {"gps": "of 3 of 4 images"}
     assert places_figure(none, frames) == {}

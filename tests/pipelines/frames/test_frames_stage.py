@@ -23,7 +23,7 @@ from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.schema import dataclass_from_json
 from msgs_slam.pipelines.sfm import driver as sfm
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
-from msgs_slam.pipelines.source.opening import source_digest
+from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.system.memory import windows_of
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration
@@ -177,10 +177,10 @@ def test_pictures_that_change_while_they_are_read_are_noticed(
     """One vanishes at the first reading, one is exchanged at the second: the stage says so, and keeps none of it."""
     folder = tmp_path / "walk"
     shutil.copytree(bent_walk.folder, folder)
-    digest = source_digest(folder, "images")
+    digest = open_recording(folder, "images").digest
 
     def same_source() -> None:
-        if source_digest(folder, "images") != digest:
+        if open_recording(folder, "images").digest != digest:
             raise InputError("the source has changed")
 
     def bring(label: str, item: int, act: Callable[[], object]) -> dict:

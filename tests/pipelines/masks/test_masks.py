@@ -30,7 +30,7 @@ from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.render.api import Rendering
 from msgs_slam.pipelines.sfm.features import extract_features
 from msgs_slam.pipelines.sfm.flow import corners
-from msgs_slam.pipelines.source.opening import open_source
+from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame, Intrinsics
 from tests.dense_volumes import to_dense
@@ -63,7 +63,7 @@ def write_mask(path: Path, left_out: NDArray[np.bool_]) -> None:
 def test_masks_are_found_by_both_names_and_reduced(pictures: Path, tmp_path: Path) -> None:
     write_mask(tmp_path / "masks" / "view0.jpg.png", left_half())
     write_mask(tmp_path / "masks" / "view2.png", ~left_half())
-    masks = open_masks(tmp_path / "masks", open_source(pictures))
+    masks = open_masks(tmp_path / "masks", open_recording(pictures))
     first, second, third = (masks.left_out(i, WIDTH // 2, HEIGHT // 2) for i in range(3))
     assert first is not None
     assert third is not None
@@ -195,7 +195,7 @@ def test_frames_between_are_searched_where_a_keyframe_shows_people(
         if 5 <= frame.id <= 7:
             image[20:80, 40:70] = (0, 0, 255)
         write_rgb(tmp_path / "picked" / frame.name, image)
-    masks = FrameMasks(load_config(), open_source(tmp_path / "picked"), tmp_path / "people", tmp_path / "picked", 1)
+    masks = FrameMasks(load_config(), open_recording(tmp_path / "picked"), tmp_path / "people", tmp_path / "picked", 1)
     masks.find_people(frames, [0, 3, 6, 9], SilentProgress())
     masks.leave_out(frames, [0, 3, 6, 9], None, 0, SilentProgress())
     searched = sorted(int(p.name[:6]) for p in (tmp_path / "people" / "masks").iterdir())
@@ -209,7 +209,7 @@ def test_frames_between_are_searched_where_a_keyframe_shows_people(
     masks.find_people(frames, [0, 3, 6, 9], SilentProgress())
 
     shutil.copytree(tmp_path / "people" / "masks", tmp_path / "stands" / "masks")
-    masks = FrameMasks(load_config(), open_source(tmp_path / "picked"), tmp_path / "stands", tmp_path / "picked", 1)
+    masks = FrameMasks(load_config(), open_recording(tmp_path / "picked"), tmp_path / "stands", tmp_path / "picked", 1)
     judged = [(r, np.ones(r.max() + 1, np.int8)) for r in masks.regions(frames, [0, 3, 6, 9])]
     masks.leave_out(frames, [0, 3, 6, 9], judged, 0, SilentProgress())
     assert [f.id for f in frames if masks.left_out(f, WIDTH, HEIGHT) is not None] == []
