@@ -1,4 +1,4 @@
-"""Events of a run as one JSON object a line on stderr and nothing else there, for programs that watch.
+"""Events of a run as one JSON object a line on stderr, for programs that watch; libraries may print text there too.
 
 `--log-format json`. Each has `event` and `time` (seconds since 1970): stage, progress, warning, log, stopping, and one
 of result, stopped, error at the end.
@@ -6,13 +6,11 @@ of result, stopped, error at the end.
 
 import json
 import logging
-import os
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from itertools import pairwise
 from signal import SIGINT
 from typing import Any, TypeVar
@@ -23,28 +21,14 @@ from ..pipelines.system.progress import BEGUN, StageEvent
 
 T = TypeVar("T")
 _SECONDS_BETWEEN = 0.2
-_STDERR = 2
-_AT_ONCE = 1 << 16
-_target_fd: list[int] = []
-"""Where the lines go while the standard error output is watched; empty: to sys.stderr."""
 _stage: dict[str, Any] = {}
 """The stage that runs."""
 
 
 def write_line(event: str, **values: Any) -> None:
     """{"event": ..., "time": seconds since 1970, ...}, in one piece whatever else is written."""
-    _write(json.dumps({"event": event, "time": round(time.time(), 3), **values}))
-
-
-def _write(line: str) -> None:
-    line += "\n"
-    if not _target_fd:
-        sys.stderr.write(line)
-        sys.stderr.flush()
-        return
-    rest = line.encode("ascii")
-    while rest:
-        rest = rest[os.write(_target_fd[-1], rest) :]
+    sys.stderr.write(json.dumps({"event": event, "time": round(time.time(), 3), **values}) + "\n")
+    sys.stderr.flush()
 
 
 class Interrupted(click.ClickException):
@@ -106,84 +90,23 @@ def is_asked_for(arguments: Iterable[str]) -> bool:
 
 
 @contextmanager
-def json_stderr() -> Iterator[None]:
-    """Write everything on stderr as JSON lines inside this block: prints of libraries, other threads and child
-    processes become {"event": "log", "level": "print"}, the outcome the last line. Always ends with SystemExit."""
+def json_outcome() -> Iterator[None]:
+    """Report how the command in this block ends as a JSON line. Always ends with SystemExit."""
     code = 0
-    with _captured_stderr():
-        try:
-            yield
-        except click.exceptions.Exit as ended:
-            code = ended.exit_code
-        except SystemExit as ended:
-            code = ended.code if isinstance(ended.code, int) else int(bool(ended.code))
-        except (click.Abort, KeyboardInterrupt, Interrupted) as error:
-            code = Interrupted.exit_code
-            write_line("stopped", signal=int(SIGINT), message=str(error), exit_code=code)
-        except click.ClickException as error:
-            code = error.exit_code
-            write_line("error", message=error.format_message(), exit_code=code)
-        except Exception as error:
-            code = 1
-            trace = "".join(traceback.format_exception(error))
-            write_line("error", message=f"{type(error).__name__}: {error}", exit_code=code, traceback=trace)
+    try:
+        yield
+    except click.exceptions.Exit as ended:
+        code = ended.exit_code
+    except SystemExit as ended:
+        code = ended.code if isinstance(ended.code, int) else int(bool(ended.code))
+    except (click.Abort, KeyboardInterrupt, Interrupted) as error:
+        code = Interrupted.exit_code
+        write_line("stopped", signal=int(SIGINT), message=str(error), exit_code=code)
+    except click.ClickException as error:
+        code = error.exit_code
+        write_line("error", message=error.format_message(), exit_code=code)
+    except Exception as error:
+        code = 1
+        trace = "".join(traceback.format_exception(error))
+        write_line("error", message=f"{type(error).__name__}: {error}", exit_code=code, traceback=trace)
     sys.exit(code)
-
-
-@contextmanager
-def _captured_stderr() -> Iterator[None]:
-    """Turn what is printed on the process's stderr into lines; nothing where sys.stderr is something else (a test)."""
-    try:
-        real = sys.stderr.fileno() == _STDERR
-    except (AttributeError, OSError, ValueError):
-        real = False
-    if not real:
-        yield
-        return
-    sys.stderr.flush()
-    kept, (reading, writing), before = os.dup(_STDERR), os.pipe(), sys.stderr
-    os.dup2(writing, _STDERR)
-    os.close(writing)
-    # What was a file can be sought in, and a pipe cannot: the old stream would try.
-    sys.stderr = open(_STDERR, "w", buffering=1, encoding="utf-8", errors="backslashreplace", closefd=False)  # noqa: SIM115
-    _target_fd.append(kept)
-    reader = threading.Thread(target=_report_prints, args=(reading,), daemon=True)
-    reader.start()
-    try:
-        yield
-    finally:
-        with suppress(OSError):
-            sys.stderr.flush()
-        sys.stderr = before
-        nowhere = os.open(os.devnull, os.O_WRONLY)  # what is printed from here on would not be JSON
-        os.dup2(nowhere, _STDERR)
-        os.close(nowhere)
-        reader.join(timeout=2.0)  # a child that still runs holds the other end
-
-
-def _report_prints(source: int) -> None:
-    """A line for each line that comes; carriage returns end lines too."""
-    rest = b""
-    while data := os.read(source, _AT_ONCE):
-        *lines, rest = (rest + data).replace(b"\r", b"\n").split(b"\n")
-        for line in filter(None, lines):
-            _report_print(line)
-    if rest:
-        _report_print(rest)
-
-
-def _report_print(line: bytes) -> None:
-    text = line.decode("utf-8", errors="backslashreplace")
-    with suppress(OSError):
-        if _is_event(text):
-            _write(text)
-        else:
-            write_line("log", level="print", message=text)
-
-
-def _is_event(text: str) -> bool:
-    """Whether it is a line of `write_line` already, as a process of this program has written it that works for it."""
-    try:
-        return text.isascii() and {"event", "time"} <= json.loads(text).keys()
-    except (ValueError, AttributeError):
-        return False

@@ -16,20 +16,21 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 from ..formats.errors import InputError, SettingError
 from ..pipelines.config import EXPORTS, STAGES
 from ..pipelines.system.wording import quoted
-from . import looking
-from .batch import batch, work
-from .json_lines import Interrupted, is_asked_for, json_stderr
-from .models import doctor, models
+from . import results
+from .batch import batch
+from .doctor import doctor
+from .json_lines import Interrupted, is_asked_for, json_outcome
+from .models import models
 from .options import (
     FOLDER,
     OVERWRITE,
     RUN_ARGUMENT,
     UNTIL,
     chosen_config,
-    cluster_workers,
     device_option,
     engine_options,
     hold_out_option,
+    open_cluster,
     open_run,
     quality_option,
     settings_options,
@@ -59,7 +60,7 @@ class FriendlyGroup(click.Group):
         words = sys.argv[1:] if args is None else list(args)
         if not is_asked_for(words):
             return super().main(args, *rest, **more)
-        with json_stderr():
+        with json_outcome():
             sys.exit(super().main(args, *rest, **more | {"standalone_mode": False}))
 
     def resolve_command(
@@ -138,7 +139,6 @@ def main() -> None:
     msgs-slam resume video.msgs         resume an interrupted run
     msgs-slam extend RUN more.mp4       extend a finished run with another video; its map is kept
     msgs-slam batch FOLDER --out RUNS   many recordings, on one machine or many
-    msgs-slam work RUN --shard K/N      one of many processes at one long run
     msgs-slam status video.msgs         what is done, what was found
     msgs-slam export video.msgs         write the export files again, or elsewhere
     msgs-slam report video.msgs         one HTML page: what was found, how good, what to film better
@@ -188,7 +188,7 @@ def reconstruct(
     run = RunFolder(out) if out else default_run_folder(sources[0])
     config = chosen_config(config_file, overrides, given, existing_config(run))
     with (
-        cluster_workers(engine_name, address, config, output) as workers,
+        open_cluster(engine_name, address, config, output) as workers,
         output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"),
     ):
         records = run_reconstruct(one_source(sources, run), run, config, output.progress(), until, workers)
@@ -230,7 +230,7 @@ def resume(
     require_run(run)
     config = chosen_config(config_file, overrides, given, load_settings(run))
     with (
-        cluster_workers(engine_name, address, config, output) as workers,
+        open_cluster(engine_name, address, config, output) as workers,
         output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"),
     ):
         records = run_resume(run, output.progress(), config, until, workers, redo=redo or "")
@@ -329,7 +329,7 @@ def demo(
 ) -> None:
     """Reconstruct a synthetic test clip and print its errors against ground truth."""
     config = chosen_config(config_file, overrides, given)
-    from ..pipelines.demo import demo_summary, run_demo
+    from ..pipelines.evaluation.demo import demo_summary, run_demo
     from ..pipelines.reconstruct import reconstruct as run_reconstruct
     from ..pipelines.run.folder import RunFolder
 
@@ -370,11 +370,10 @@ def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
     click.echo(config_to_toml(load_config(config_file, overrides)), nl=False)
 
 
-for command in (looking.status, looking.evaluate, looking.report, looking.render, looking.view):
+for command in (results.status, results.evaluate, results.report, results.render, results.view):
     main.add_command(command)
 main.add_command(models)
 main.add_command(batch)
-main.add_command(work)
 main.add_command(doctor)
 
 if __name__ == "__main__":

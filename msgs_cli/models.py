@@ -1,15 +1,15 @@
-"""`msgs-slam models` and `doctor`: learned models in the cache, and what is installed."""
+"""`msgs-slam models`: learned models in the cache."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from ..pipelines.system.wording import BAD, Finding
+from ..pipelines.system.wording import BAD
+from .doctor import print_findings
 from .output import format_table, say, terminal_width
 
 if TYPE_CHECKING:
@@ -161,14 +161,14 @@ def check(names: tuple[str, ...]) -> None:
     cards = own | {m.name: store.card(m) for m in with_card if chosen or store.is_here(m)}
     if not cards:
         raise InputError(f"no network with a card is in {store.cache}; run: msgs-slam models pull")
-    from ..pipelines.demo import known_view
+    from ..pipelines.evaluation.demo import known_view
     from ..pipelines.networks.check import check_network
 
     view = known_view()
     found = {name: check_network(card, view) for name, card in cards.items()}
     for name, findings in found.items():
         say(f"{name}: {cards[name].model}")
-        _print_findings(findings)
+        print_findings(findings)
     if any(f.state == BAD for findings in found.values() for f in findings):
         sys.exit(1)
 
@@ -185,26 +185,3 @@ def path(name: str) -> None:
     if not store.is_here(model):
         raise InputError(f"{name} is not in {store.cache}; run: msgs-slam models pull {name}")
     click.echo(str(store.path(model)))
-
-
-@click.command()
-def doctor() -> None:
-    """Check this machine and suggest fixes.
-
-    Exit code 1 where something would keep a reconstruction from running.
-    """
-    from ..pipelines.doctor import examine
-
-    findings = examine(Path("."))
-    _print_findings(findings)
-    if any(f.state == BAD for f in findings):
-        sys.exit(1)
-
-
-def _print_findings(findings: Sequence[Finding]) -> None:
-    """A line for each finding, another for what to do."""
-    width = max(len(f.name) for f in findings)
-    for f in findings:
-        say(f"{f.state:4}  {f.name:{width}}  {f.text}")
-        if f.fix:
-            say(f"{'':4}  {'':{width}}  fix: {f.fix}")

@@ -13,7 +13,7 @@ from ..pipelines.config import STAGES, Option, settings_with_options
 
 if TYPE_CHECKING:
     from ..pipelines.config import Config
-    from ..pipelines.engine.placement import ClusterWorkers
+    from ..pipelines.engine.cluster import RayCluster
     from ..pipelines.run.folder import RunFolder
     from .output import Output
 
@@ -67,27 +67,19 @@ def engine_options(help: str) -> Callable[[Callable[..., None]], Callable[..., N
     return decorate
 
 
-def require_engine(name: str, address: str) -> None:
-    """Refuse an address that nobody would join."""
-    if address and name != "ray":
-        raise click.UsageError("--address is of --engine ray")
-
-
 @contextmanager
-def cluster_workers(name: str, address: str, config: Config, output: Output) -> Iterator[ClusterWorkers | None]:
-    """The workers that take a run's tasks, None for this process; each with as many threads, or the results would
-    differ."""
-    require_engine(name, address)
+def open_cluster(name: str, address: str, config: Config, output: Output) -> Iterator[RayCluster | None]:
+    """The Ray cluster that takes the tasks of a command in this block, None for this process."""
     if name == "local":
+        if address:
+            raise click.UsageError("`--address` needs `--engine ray`")
         yield None
         return
-    from ..pipelines.engine.placement import ClusterWorkers, RayCluster
+    from ..pipelines.engine.cluster import RayCluster
 
-    cluster = RayCluster(address)
+    cluster = RayCluster(address, config.run.threads, int(config.run.device == "cuda"), not output.quiet)
     try:
-        threads = config.run.threads or cluster.smallest_node
-        gpus = int(config.run.device == "cuda")
-        yield ClusterWorkers(cluster, threads, gpus, cluster.room(threads), output.options)
+        yield cluster
     finally:
         cluster.close()
 
@@ -137,37 +129,14 @@ def chosen_config(
     return config
 
 
-def option_words(given: Mapping[str, str | int | None], overrides: Iterable[str], config: Config) -> list[str]:
-    """The options of settings that were given, for the command line of another process, which may work in another
-    folder: the files and folders that they name are made absolute.
-
-    Args:
-        given: of the options of settings, by `section__key`; None where one is not given.
-        overrides: of --set.
-        config: the settings that all of the command line, --config included, amounts to.
-    """
-    from ..pipelines.config import config_to_dict
-    from ..pipelines.read_config import with_absolute_paths
-
-    typed, absolute = config_to_dict(config), config_to_dict(with_absolute_paths(config))
-    paths = {f"{s}.{k}": v for s, keys in absolute.items() for k, v in keys.items() if v != typed[s][k]}
-    options = {key.replace(".", "__"): f.metadata["option"].name for key, f in settings_with_options().items()}
-    words = [f"--set={text}" for text in overrides] + [f"--set={key}={value}" for key, value in paths.items()]
-    return words + [
-        f"--{options[key]}={value}"
-        for key, value in given.items()
-        if value is not None and key.replace("__", ".", 1) not in paths
-    ]
-
-
 def use_threads(run: RunFolder | None = None) -> None:
     """Let the libraries of this process use as many CPU threads as the run's settings say, or all that there are: a
     container's share, not its machine's."""
-    from ..pipelines.engine.tasks import set_threads
+    from ..pipelines.engine.tasks import limit_threads
     from ..pipelines.run.folder import load_settings
     from ..pipelines.system.memory import available_cpus
 
-    set_threads((load_settings(run).run.threads if run is not None else 0) or available_cpus())
+    limit_threads((load_settings(run).run.threads if run is not None else 0) or available_cpus())
 
 
 def open_run(path: Path) -> RunFolder:

@@ -37,8 +37,8 @@ from .json_lines import JsonHandler, JsonProgress, write_line
 if TYPE_CHECKING:
     from tqdm import tqdm
 
+    from ..pipelines.engine.status import StageStatus
     from ..pipelines.run.manifest import StageRecord
-    from ..pipelines.status import StageStatus
 
 KEY_FIGURES = {
     "frames": ("frames", "keyframes_placed", "calibration", "focal_px", "focal_sd_px", "still_left_out", "gps"),
@@ -102,12 +102,6 @@ class Output:
         if self.as_json:
             return JsonProgress(job)
         return BarProgress() if sys.stderr.isatty() else LineProgress(job)
-
-    @property
-    def options(self) -> tuple[str, ...]:
-        """The options of a command by which a process started for this one prints the same."""
-        more = ("-q",) if self.quiet else ("-v",) if self.verbose else ()
-        return (*more, "--log-format", "json") if self.as_json else more
 
     def task_progress(self, name: str) -> Progress:
         """Set logging up anew for a named task of many; returns its progress, lines rather than bars."""
@@ -299,18 +293,13 @@ def status_table(stages: Sequence[StageStatus], everything: bool = False) -> str
     """One row a stage: state, seconds, peak memory, key figures or all of them."""
     rows = []
     for stage in stages:
-        expected = "" if stage.expected_mb is None else f"{stage.expected_mb:.0f}"
         if (record := stage.record) is None:
-            rows.append([stage.name, stage.state_text, "", "", expected, ""])
+            rows.append([stage.name, stage.state_text, "", "", ""])
             continue
         wanted = record.figures if everything else [k for k in KEY_FIGURES[stage.name] if k in record.figures]
         figures = ", ".join(f"{key} {figure_text(record.figures[key], key)}" for key in wanted)
-        rows.append(
-            [stage.name, stage.state, f"{record.seconds:.1f}", f"{record.peak_memory_mb:.0f}", expected, figures]
-        )
-    header = ["stage", "state", "seconds", "peak MB", "expected MB", "figures"]
-    shown = [n for n in range(len(header)) if n != 4 or (everything and any(row[n] for row in rows))]
-    return format_table([header[n] for n in shown], [[row[n] for n in shown] for row in rows], terminal_width())
+        rows.append([stage.name, stage.state, f"{record.seconds:.1f}", f"{record.peak_memory_mb:.0f}", figures])
+    return format_table(["stage", "state", "seconds", "peak MB", "figures"], rows, terminal_width())
 
 
 def scale_lines(root: Path, records: dict[str, StageRecord]) -> list[str]:
@@ -338,17 +327,13 @@ def report_run(output: Output, root: Path, records: dict[str, Any]) -> None:
 
 def print_summary(root: Path, records: dict[str, Any]) -> None:
     """Print the table, what is not said yet, and where the results are."""
-    from ..pipelines.reconstruct import all_stages
-    from ..pipelines.run.folder import RunFolder
-    from ..pipelines.status import DONE, StageStatus, about_new_networks
+    from ..pipelines.engine.status import DONE, StageStatus
 
     say(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
     for line in warning_lines(records, was_shown):
         say(line, err=True)
     for line in scale_lines(root, records):
         say(line)
-    if line := about_new_networks(RunFolder(root), all_stages):
-        say(f"\n{line}")
     if "export" in records:
         say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
         if (page := root / "export" / "map.html").exists():

@@ -1,32 +1,46 @@
-"""Many recordings: a run each, one table, going on after failures; shared between as many processes as one likes.
+"""Many recordings: a run each, one table, going on after failures.
 
 A recording's run folder is all that is known of it, and its lock sees to it that one process at a time works on it. So
 any number of batches over the same folders may be started, killed and started again, on one machine or many.
 """
 
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from ..formats.atomic import unique_temp_names, write_text
 from ..formats.datasets import looks_like_recording
-from ..formats.errors import InputError
+from ..formats.errors import InputError, RecoverableError
 from ..formats.images import VIDEO_SUFFIXES
 from ..formats.textfile import write_json
 from .config import STAGES, Config
-from .engine.placement import Command, Placement
+from .read_config import with_absolute_paths
 from .reconstruct import existing_config, reconstruct
 from .run.folder import RunFolder, load_records
 from .run.lock import RunBusyError
 from .run.manifest import keyframe_psnr
-from .system.progress import Progress, log
+from .system.progress import Progress, SilentProgress, Stopped, is_asked, log, soft_stop, stop_if_asked
 from .system.wording import markdown_table
 
+if TYPE_CHECKING:
+    from .engine.cluster import RayCluster
+
+T = TypeVar("T")
+_TRIES = 2
+"""How often the process of a recording is started when it is lost."""
 _MAX_NAMED = 5
-_NOT_LISTED = (".", "__MACOSX")
-"""How names begin that nobody gave: hidden files, and what macOS adds to an archive."""
+_HIDDEN_PREFIXES = (".", "__MACOSX")
+"""Beginnings of names: hidden files, and what macOS adds to an archive."""
 DONE, FAILED, ELSEWHERE, UNFINISHED, NOT_YET = "done", "failed", "in another process", "unfinished", "not yet"
 _FIGURES = (("frames", "frames"), ("tracking", "posed"), ("tracking", "keyframes"))
 
@@ -50,7 +64,7 @@ def find_recordings(folder: Path, runs: Path) -> list[Recording]:
     fails. Other folders are reported. Raises InputError where there is none."""
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder. `batch` takes a folder of videos, image folders or data sets")
-    visible = [p for p in sorted(folder.iterdir()) if not p.name.startswith(_NOT_LISTED) and not _is_run(p, runs)]
+    visible = [p for p in sorted(folder.iterdir()) if not p.name.startswith(_HIDDEN_PREFIXES) and not _is_run(p, runs)]
     sources = [p for p in visible if _is_recording(p)]
     others = [p.name for p in visible if p not in sources and p.is_dir() and any(p.iterdir())]
     if others:
@@ -81,73 +95,79 @@ def _is_recording(path: Path) -> bool:
         return True
 
 
+@dataclass(frozen=True)
+class Job:
+    """A recording with its settings, the last stage, the CPU threads where the settings leave them open (0: all), and
+    what sets logging up in the process that works on it."""
+
+    recording: Recording
+    config: Config
+    until: str
+    threads: int
+    output: Output
+
+
+class Output(Protocol):
+    """Sets logging up for a named recording and returns its progress; pickled with the job."""
+
+    def task_progress(self, name: str) -> Progress:
+        """Set up and return the progress."""
+        ...
+
+
 def run_batch(
-    recordings: Sequence[Recording], placement: Placement, options: Sequence[str], cpus: int = 1, gpus: int = 0
+    recordings: Sequence[Recording],
+    read: Callable[[Config | None], Config],
+    until: str,
+    output: Output,
+    cluster: RayCluster | None = None,
 ) -> list[Recording]:
-    """Bring the runs of these recordings up to date, each by a process of its own; what another process works on is
+    """Bring the runs of these recordings up to date, each in a process of its own; what another process works on is
     left to it.
 
     Args:
         recordings: with the folders of their runs.
-        placement: where the processes run.
-        options: of the command `batch`, for each of them.
-        cpus: CPUs that each takes of a node.
-        gpus: GPUs that each takes of a node.
+        read: lays the settings asked for over those that a run has already, if any.
+        until: the last stage.
+        output: shows how far each is.
+        cluster: where they are reconstructed; None for this machine, one after the other.
 
     Returns:
         The recordings that failed.
     """
-    by_name = {r.name: r for r in recordings}
-    commands = [
-        Command(
-            r.name,
-            (
-                "msgs_slam",
-                "batch",
-                str(r.source.parent),
-                "--out",
-                str(r.run.parent),
-                "--placed",
-                r.name,
-                str(r.source),
-                *options,
-            ),
-            cpus,
-            gpus,
-            (r.source, r.run.parent),
-        )
-        for r in recordings
-    ]
-    failed = []
-    for result in placement.run(commands):
-        if not result.failure:
-            continue
-        recording = by_name[result.command.name]
-        if not (result.is_reported and recording.failure_file.exists()):
-            _write_failure(recording, result.failure)
-        log.error("%s: %s", recording.name, _last_line(recording.failure_file))
-        failed.append(recording)
-    return failed
+    jobs = []
+    for recording in recordings:
+        try:
+            config = with_absolute_paths(read(existing_config(RunFolder(recording.run))))
+            jobs.append(Job(recording, config, until, cluster.threads if cluster else 0, output))
+        except InputError as error:
+            _write_failure(recording, str(error))
+    folders = list(dict.fromkeys(folder for r in recordings for folder in (r.source.parent, r.run.parent)))
+    ended = run_in_processes(_run_job, jobs) if cluster is None else cluster.run(_run_job, jobs, folders)
+    for number, result in ended:
+        recording = jobs[number].recording
+        try:
+            result()
+        except Exception as error:  # of its process: what the recording itself raises is written down there
+            _write_failure(recording, str(error))
+        if recording.failure_file.exists():
+            log.error("%s: %s", recording.name, _last_line(recording.failure_file))
+    return [r for r in recordings if r.failure_file.exists()]
 
 
-def reconstruct_one(
-    recording: Recording, read: Callable[[Config | None], Config], progress: Progress, until: str, threads: int = 0
-) -> str:
-    """Reconstruct one recording in this process; it may be done twice, at any time, by any process.
+def _run_job(job: Job, _: Progress) -> None:
+    progress = job.output.task_progress(job.recording.name)
+    log.info("%s: %s", job.recording.name, reconstruct_one(job, progress))
 
-    Args:
-        recording: its source, and the folder of its run.
-        read: lays the settings asked for over those that the run has already, if any.
-        progress: shows how far it is.
-        until: the last stage.
-        threads: CPU threads where the settings leave them open, 0 for all.
 
-    Returns:
-        DONE, FAILED with the reason beside the run, or ELSEWHERE.
-    """
+def reconstruct_one(job: Job, progress: Progress) -> str:
+    """Reconstruct one recording in this process; it may be done twice, at any time, by any process. Returns DONE,
+    FAILED with the reason beside the run, or ELSEWHERE."""
+    recording = job.recording
+    recording.failure_file.unlink(missing_ok=True)
     try:
         run = RunFolder(recording.run)
-        reconstruct(recording.source, run, read(existing_config(run)), progress, until, threads=threads)
+        reconstruct(recording.source, run, job.config, progress, job.until, threads=job.threads)
     except RunBusyError:
         return ELSEWHERE
     except InputError as error:
@@ -156,8 +176,66 @@ def reconstruct_one(
     except Exception:
         _write_failure(recording, traceback.format_exc())
         return FAILED
-    recording.failure_file.unlink(missing_ok=True)
     return DONE
+
+
+def run_in_processes(
+    work: Callable[[T, Progress], object], tasks: Sequence[T]
+) -> Iterator[tuple[int, Callable[[], None]]]:
+    """Call `work`, a function of a module's top level, on each task in a process of its own, one after the other.
+
+    Yields the number of each task as its process ends, and what raises RecoverableError where that was lost twice
+    (killed, out of memory). The first signal to stop is passed on to the process; one whose parent is gone stops.
+    """
+    for number, task in enumerate(tasks):
+        for _ in range(_TRIES):
+            stop_if_asked()
+            code = _run_process(work, task)
+            stop_if_asked()
+            if code >= 0:
+                break
+            log.warning("task %d: its process was lost (%s)", number + 1, signal.Signals(-code).name)
+        yield number, partial(_require_ended, code)
+
+
+def _require_ended(code: int) -> None:
+    if code:
+        memory = ", for want of memory perhaps" if code == -signal.SIGKILL else ""
+        how = f"ended by {signal.Signals(-code).name}{memory}" if code < 0 else f"exit code {code}"
+        raise RecoverableError(f"its process was lost: {how}")
+
+
+def _run_process(work: Callable[[T, Progress], object], task: T) -> int:
+    """The exit code of the process, negative where a signal ended it."""
+    process = multiprocessing.get_context("spawn").Process(target=_in_child, args=(work, task), daemon=True)
+    process.start()
+    is_passed_on = False
+    try:
+        while process.exitcode is None:
+            process.join(0.2)
+            if is_asked() and not is_passed_on:
+                process.terminate()
+                is_passed_on = True
+        return process.exitcode
+    finally:
+        process.kill()
+        process.join()
+
+
+def _in_child(work: Callable[[T, Progress], object], task: T) -> None:
+    os.setsid()  # a terminal's Ctrl-C goes to all processes of a session, and the parent passes on what it means
+    threading.Thread(target=_stop_with_parent, daemon=True).start()
+    try:
+        with soft_stop(lambda number: None):
+            work(task, SilentProgress())
+    except Stopped as stopped:
+        sys.exit(128 + stopped.number)
+
+
+def _stop_with_parent() -> None:
+    if (parent := multiprocessing.parent_process()) is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _write_failure(recording: Recording, reason: str) -> None:

@@ -1,8 +1,6 @@
 """The whole pipeline from a source to a finished run, for the commands `reconstruct`, `resume` and `status`."""
 
-import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from pathlib import Path
 
 from ..formats.atomic import temporary_of, unique_temp_names, write_text
@@ -12,7 +10,6 @@ from ..formats.video import probe_video
 from .config import SOURCE_LIST, STAGES, Config, overridden, with_method, without_method
 from .engine.runner import run_stages
 from .engine.stages import Later, Stage, TaskWorkers
-from .engine.tasks import BETWEEN_LOOKS, Shard, SharedWorkers, boards_in
 from .export.inputs import check_export, export_inputs
 from .frames.inputs import check_frames, frames_division, frames_inputs
 from .mapping.division import mapping_division, mapping_inputs
@@ -20,13 +17,14 @@ from .paper.constants import final_inputs, paper_inputs
 from .proxy.inputs import check_proxy, left_to_auto, proxy_inputs
 from .read_config import with_absolute_paths
 from .run.folder import RunFolder, load_records, load_settings, load_source
-from .run.lock import LEADER, LOCK, ProgressFile, RunBusyError, locked, make_folder
+from .run.lock import LOCK, SOFT_LOCK, locked, make_folder
 from .run.manifest import StageRecord, recorded_config
+from .run.progress import ProgressFile
 from .source.recording import open_recording
 from .source.videos import require_different
 from .system.device import require_device
 from .system.memory import available_cpus
-from .system.progress import Progress, log, stop_if_asked
+from .system.progress import Progress, log
 from .system.wording import quoted
 
 
@@ -166,43 +164,6 @@ def resume(
         return _run(run, source, origin.digest, config, progress, until, workers, redo=redo)
 
 
-def work_on_run(
-    run: RunFolder,
-    shard: Shard,
-    config: Config,
-    prepare: Callable[[str], Progress],
-    until: str,
-    never_lead: bool = False,
-) -> dict[str, StageRecord]:
-    """Lead, or take the tasks that another process publishes, until the run is done up to a stage.
-
-    Args:
-        run: the run, whose first stages may be done.
-        shard: the tasks that this process does first.
-        config: the settings of the run.
-        prepare: sets logging up for a named task and returns its progress.
-        until: the last stage.
-        never_lead: take tasks until a signal comes.
-
-    Returns:
-        The records of the finished stages.
-
-    Raises:
-        InputError: as `resume` does, and for a node that cannot do a task (another version of the program, a full
-            disk); other processes go on.
-    """
-
-    workers = SharedWorkers(shard, prepare, config.run.threads or available_cpus())
-    log.info("shard %d of %d", shard.index, shard.count)
-    while True:
-        with suppress(RunBusyError):
-            if not never_lead:
-                return resume(run, prepare("run"), config, until, workers)
-        if not any(board.do_one(shard, prepare) for board in boards_in(run)):
-            stop_if_asked()
-            time.sleep(BETWEEN_LOOKS)
-
-
 def extend(run: RunFolder, videos: Sequence[Path], progress: Progress) -> dict[str, StageRecord]:
     """Add videos by the same camera to a finished run: see `docs/adding.md`. Stopped once it has begun, the same
     call or `resume` goes on.
@@ -269,8 +230,6 @@ def _run(
                 "folder: --out NEW"
             )
 
-    for board in boards_in(run):  # of a leader that was killed: its tasks are of a stage that may have ended
-        board.retire()
     threads = config.run.threads or (workers.threads if workers else threads) or available_cpus()
     with ProgressFile(progress, run) as noted:
         stages = all_stages(config.run.method)
@@ -282,9 +241,9 @@ def _require_run_or_empty(run: RunFolder) -> None:
     if not run.root.is_dir() or run.manifest_file.exists():
         return
     # All that there is when the first file is being written.
-    begun = {LOCK, LEADER, SOURCE_LIST, temporary_of(run.manifest_file).name}
-    # Other processes have names of their own for the list, and for a look at a leader.
-    others = (temporary_of(run.path(SOURCE_LIST)).stem, f"{LEADER}-")
+    begun = {LOCK, SOFT_LOCK, SOURCE_LIST, temporary_of(run.manifest_file).name}
+    # Other processes have names of their own for the list.
+    others = temporary_of(run.path(SOURCE_LIST)).stem
     if any(p.name not in begun and not p.name.startswith(others) for p in run.root.iterdir()):
         raise InputError(f"{run.root} exists and is not a run folder. Choose another with --out FOLDER")
 

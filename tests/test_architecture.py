@@ -20,12 +20,12 @@ FORBIDDEN = {
 
 FLOORS = (
     {"config", "types"}, {"geometry", "read_config"}, {"providers", "system"}, {"compute"},
-    {"render", "networks"}, {"depth"}, {"doctor", "run", "sfm"}, {"engine", "source"},
-    {"labels", "masks"}, {"frames", "proxy"}, {"mapping", "tracking"}, {"global_ba", "outcome", "status"},
-    {"paper", "scene"}, {"export"}, {"reconstruct"}, {"batch", "evaluation"}, {"demo", "viewer"},
+    {"render", "networks"}, {"depth"}, {"run", "sfm"}, {"engine", "source"},
+    {"labels", "masks"}, {"frames", "proxy"}, {"mapping", "tracking"}, {"global_ba", "outcome"},
+    {"paper", "scene"}, {"export"}, {"reconstruct"}, {"batch", "evaluation"}, {"viewer"},
 )  # fmt: skip
 """The rooms of pipelines/: its folders and its flat files, each above all that it imports."""
-MOST_FLAT = 10
+MOST_FLAT = 8
 
 
 def names_imported_by(node: ast.AST, path: Path) -> set[str]:
@@ -188,7 +188,6 @@ def test_nothing_is_unpickled() -> None:
 UNSAFE_IMPORTS = {"subprocess", "pty", "marshal", "shelve", "dill", "cloudpickle", "joblib", "yaml", "ctypes"}
 UNSAFE_BUT_HERE = {
     "pipelines/system/memory.py": {"ctypes"},
-    "pipelines/engine/placement.py": {"subprocess"},
     "pipelines/evaluation/html.py": {"subprocess"},
     "formats/video_streams.py": {"subprocess"},
     "formats/datasets/calibration.py": {"yaml"},

@@ -28,8 +28,8 @@ from .staleness import (
     rerun_reason,
     stage_fingerprint,
 )
-from .tasks import set_threads
-from .time_left import USUAL, TimeLeft, work_of
+from .tasks import limit_threads
+from .time_left import TimeLeft
 
 _PROCESS = Path("/proc/self")
 
@@ -67,7 +67,7 @@ def run_stages(
         book.save()
     save_settings(run, config)
     settled = replace(config, run=replace(config.run, threads=config.run.threads or threads))
-    reporter = StageReporter(progress, wanted, records, settled)
+    reporter = StageReporter(progress, wanted, records, settled.run.threads)
     for stage in wanted:
         record = book.find(stage.name)
         why = "" if record is None else rerun_reason(stage, run, record, config, upstream, inputs[stage.name])
@@ -136,30 +136,21 @@ class StageReporter:
     """Reports the stages as they begin and end, and how long the rest will take."""
 
     def __init__(
-        self, progress: Progress, wanted: Sequence[Stage], records: Mapping[str, StageRecord], config: Config
+        self, progress: Progress, wanted: Sequence[Stage], records: Mapping[str, StageRecord], threads: int
     ) -> None:
-        self._progress, self._names = progress, [stage.name for stage in wanted]
-        self._records, self._config = records, config
+        self._progress, self._names, self._threads = progress, [stage.name for stage in wanted], threads
         self._left = TimeLeft({name: records[name].seconds for name in self._names if name in records}, self._names)
 
     def report(self, name: str, state: str, record: StageRecord | None = None) -> None:
         """Report that a stage has come into a state."""
         index, figures = self._names.index(name) + 1, record.figures if record else {}
-        seconds, of_work = record.seconds if record else 0.0, ""
-        # What there is to do is known as soon as the first stage is done; nobody asks where all is up to date.
-        first = record if name == STAGES[0] else self._records.get(STAGES[0])
-        if state in (BEGUN, ENDED) and first is not None and self._left.work is USUAL:
-            self._left.work = work_of(self._config, first.figures)
-            of_work = self._left.work.text
-        if state == (ENDED if name == STAGES[0] else BEGUN) and name != self._names[-1]:
-            self._left.measure()
-        left = self._left.left
-        self._progress.stage(StageEvent(name, index, len(self._names), state, seconds, figures, left, of_work))
+        seconds, left = record.seconds if record else 0.0, self._left.left
+        self._progress.stage(StageEvent(name, index, len(self._names), state, seconds, figures, left))
 
     @contextmanager
     def running(self, name: str) -> Iterator[Callable[[StageRecord], None]]:
         """The stage runs in this block, which hands its record over at its end."""
-        set_threads(self._config.run.threads)  # this machine is measured with as many
+        limit_threads(self._threads)
         self._left.begin(name)
         self.report(name, BEGUN)
 

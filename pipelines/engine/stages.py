@@ -39,7 +39,7 @@ class TaskWorkers(Protocol):
         """Threads that each takes: the same everywhere, or the results would differ."""
         ...
 
-    def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T], folder: Path) -> list[R]:
+    def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T], folder: Path, progress: Progress) -> list[R]:
         """Do `work` on every task, below `folder`, a stage's unfinished one; returns its results in order."""
         ...
 
@@ -92,7 +92,7 @@ class StageContext:
         returns its results in order. A task leaves files below `folder`, and does nothing where they are."""
         if self.workers is None:
             return [self._done(work, task) for task in tasks]
-        return self.workers.each(work, tasks, self.folder)
+        return self.workers.each(work, tasks, self.folder, self.progress)
 
     def _done(self, work: Callable[[T, Progress], R], task: T) -> R:
         result = work(task, self.progress)

@@ -36,13 +36,6 @@ def effective_inputs(stage: Stage, config: Config, record: StageRecord | None, i
     return kept | {k: v for k, v in (was or {}).items() if k in chosen} or None
 
 
-def changed_auto_choices(stage: Stage, config: Config, record: StageRecord, inputs: Any) -> list[str]:
-    """Names of the inputs that `auto` would choose otherwise by now."""
-    if effective_inputs(stage, config, record, inputs) == inputs:
-        return []
-    return [name for name in stage.auto(config) if (record.inputs or {}).get(name) != (inputs or {}).get(name)]
-
-
 def rerun_reason(
     stage: Stage, run: RunFolder, record: StageRecord, config: Config, upstream: str, inputs: Any
 ) -> str:  # fmt: skip

@@ -1,4 +1,4 @@
-"""Memory: the limits of this process, what stages need according to past runs, and the size of the chunks that fit."""
+"""Memory: the limits of this process, and the size of the parts of a long recording that fit."""
 
 import ctypes
 import math
@@ -16,16 +16,12 @@ from ..types import Intrinsics
 
 _CGROUPS, _OWN_CGROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
-NEEDS = {
-    "frames": (380, 640, 1.7, 0), "proxy": (770, 2300, 1.8, 0), "tracking": (850, 100, 1.0, 0),
-    "mapping": (445, 350, 0, 1970), "global_ba": (490, 450, 0, 500), "export": (945, 900, 0, 1310),
-}  # fmt: skip
-"""MB that a stage needs at its peak: at least, for each million pixels of a frame (of proxy: at the size in work), each
-keyframe, each million Gaussians. Those of frames, mapping and global_ba fitted to the peaks of 63 runs of 10 to 219
-keyframes and 0.01 to 0.7 million pixels: half of them lie within 15 % (global_ba 26), nine of ten within 40 %; those of
-proxy, tracking and export, which follow the completion network in a process, to four later runs of 14 to 79 keyframes,
-which lie within 11 %. `tests/benchmarks/memory.py` compares runs."""
-GAUSSIANS = 22_000
+_FRAMES = (380, 640, 1.7)
+"""MB that structure from motion needs at its peak: at least, for each million pixels of a frame, for each keyframe."""
+_MAPPING = (445, 350, 1970)
+"""MB that mapping needs: at least, for each million pixels of a frame, for each million Gaussians. Both are fitted to
+the peaks of 63 runs of 10 to 219 keyframes: half lie within 15 %, nine of ten within 40 %."""
+_GAUSSIANS = 22_000
 """A map has about so many for each keyframe and million pixels of it."""
 VIEWS_SHARE = 0.25
 """Of the memory that mapping plans with, for views; what has no room there is read again."""
@@ -46,11 +42,11 @@ def submap_size(config: Config, camera: Intrinsics) -> int:
     limit, memory_mb = config.mapping.submap, config.run.memory_mb
     if not limit or not memory_mb:
         return limit
-    least, a_million_pixels, _, a_million_gaussians = NEEDS["mapping"]
+    least, a_million_pixels, a_million_gaussians = _MAPPING
     small = camera.at_most(config.mapping.max_side)
     pixels = small.width * small.height / 1e6
     room = (1 - VIEWS_SHARE) * memory_mb - least - a_million_pixels * camera.width * camera.height / 1e6
-    return min(limit, max(MIN_SUBMAP, int(room / (a_million_gaussians * GAUSSIANS / 1e6 * pixels))))
+    return min(limit, max(MIN_SUBMAP, int(room / (a_million_gaussians * _GAUSSIANS / 1e6 * pixels))))
 
 
 def release_free_memory() -> None:
@@ -134,7 +130,7 @@ def window_size(memory_mb: int, pixels: int) -> int:
     many: what comes out does not depend on the machine."""
     if memory_mb == 0:
         return WINDOW
-    least, a_million_pixels, a_keyframe, _ = NEEDS["frames"]
+    least, a_million_pixels, a_keyframe = _FRAMES
     return int(np.clip((memory_mb - least - a_million_pixels * pixels / 1e6) / a_keyframe, _MIN_WINDOW, WINDOW))
 
 

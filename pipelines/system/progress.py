@@ -19,14 +19,14 @@ BEGUN, ENDED, UP_TO_DATE, STOPPED, REFUSED = "begun", "done", "up to date", "sto
 
 
 def _unknown() -> None:
-    """Nobody knows how long it will take."""
+    """How long it will take is not known."""
 
 
 @dataclass(frozen=True)
 class StageEvent:
     """Stage number `index` of `of` has come into a state: begun, done, up to date (nothing to do), stopped by a signal,
     failed. seconds and figures of one that is done; left: seconds to the end of all of them at the moment of asking,
-    None where nothing is known; of_work: how much there is to do, in words, once that is known."""
+    None where nothing is known."""
 
     name: str
     index: int
@@ -35,7 +35,6 @@ class StageEvent:
     seconds: float = 0.0
     figures: Mapping[str, Any] = field(default_factory=dict)
     left: Callable[[], float | None] = _unknown
-    of_work: str = ""
 
     @property
     def title(self) -> str:
@@ -44,10 +43,9 @@ class StageEvent:
 
     @property
     def left_text(self) -> str:
-        """; about 4 min left, and for what: 46 keyframes at 640 px; or nothing."""
+        """; about 4 min left, or nothing."""
         seconds = self.left()
-        for_what = f" on this machine: {self.of_work}" if self.of_work else ""
-        return f"; {about(seconds)} left{for_what}" if seconds else ""
+        return f"; {about(seconds)} left" if seconds else ""
 
 
 def about(seconds: float) -> str:

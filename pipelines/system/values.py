@@ -1,11 +1,8 @@
-"""Values as files for any machine, or for going on after an interruption: dataclasses of this program, arrays and plain
-values. Tasks and what they return are kept so, and the snapshots of the stages."""
+"""Values as files, for going on after an interruption: dataclasses of this program, arrays and plain values."""
 
-import functools
 import json
 import math
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
@@ -14,12 +11,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.errors import InputError
 from ...formats.reading import parsing
 from ...formats.tensors import load_arrays, save_arrays
 
 _TREE = "tree"
-_OURS, _PIPELINES = "msgs_slam.pipelines.", Path(__file__).parents[1]
+_OURS = "msgs_slam.pipelines."
 
 
 def save_value(path: Path, value: Any) -> None:
@@ -37,29 +33,19 @@ def load_value(path: Path) -> Any:
         return _value(json.loads(arrays[_TREE].tobytes()), arrays)
 
 
-@functools.cache
-def name_of(function: Callable[..., Any] | type) -> str:
-    """Return "room:name", under which `of_name` finds a function or class: short, and the same in whatever file of its
-    room it stands. Raises TypeError for one that it would not find."""
-    room = function.__module__.removeprefix(_OURS).partition(".")[0]
-    name = f"{room}:{function.__qualname__}"
-    if not function.__module__.startswith(_OURS) or of_name(name) is not function:
-        raise TypeError(f"{function} does not travel")
-    return name
+def _name_of(kind: type) -> str:
+    if not kind.__module__.startswith(_OURS):
+        raise TypeError(f"{kind} is not kept in files")
+    return f"{kind.__module__.removeprefix(_OURS)}:{kind.__qualname__}"
 
 
-@functools.cache
-def of_name(name: str) -> Any:
-    """Find a function or class that this program's pipelines define. Raises InputError for any other."""
-    room, _, attribute = name.partition(":")
-    if room.isidentifier() and attribute.isidentifier():
-        root = _PIPELINES / room
-        defined = re.compile(rf"^(class|def) {attribute}\b".encode(), re.MULTILINE)
-        for file in (root.with_suffix(".py"), *sorted(root.rglob("*.py"))):
-            if file.is_file() and defined.search(file.read_bytes()):  # not what a module only imports
-                module = ".".join(file.relative_to(_PIPELINES).with_suffix("").parts)
-                return getattr(import_module(f"{_OURS}{module}"), attribute)
-    raise InputError(f"a task asks for {name}, which this version does not have: install the same one everywhere")
+def _of_name(name: str) -> type:
+    """Find a dataclass that this program's pipelines define. Raises TypeError for anything else."""
+    module, _, attribute = name.partition(":")
+    found = getattr(import_module(_OURS + module), attribute) if module.replace(".", "_").isidentifier() else None
+    if not (isinstance(found, type) and is_dataclass(found) and found.__module__ == _OURS + module):
+        raise TypeError(f"{name} is no dataclass of this program")
+    return found
 
 
 @dataclass
@@ -103,8 +89,8 @@ def _plain(value: Any, arrays: _Columns) -> Any:
         return {"dict": [[_plain(k, arrays), _plain(v, arrays)] for k, v in value.items()]}
     if is_dataclass(value) and not isinstance(value, type):
         of = {f.name: _plain(getattr(value, f.name), arrays) for f in fields(value) if f.init}
-        return {name_of(type(value)): of}
-    raise TypeError(f"{type(value)} does not travel")
+        return {_name_of(type(value)): of}
+    raise TypeError(f"{type(value)} is not kept in files")
 
 
 def _value(tree: Any, arrays: Mapping[str, NDArray]) -> Any:
@@ -120,7 +106,4 @@ def _value(tree: Any, arrays: Mapping[str, NDArray]) -> Any:
         return tuple(items) if kind == "tuple" else items
     if kind == "dict":
         return {_value(k, arrays): _value(v, arrays) for k, v in content}
-    found = of_name(kind)
-    if not (isinstance(found, type) and is_dataclass(found)):
-        raise TypeError(f"{kind} is no dataclass")
-    return found(**{name: _value(v, arrays) for name, v in content.items()})
+    return _of_name(kind)(**{name: _value(v, arrays) for name, v in content.items()})

@@ -7,7 +7,7 @@ from contextlib import suppress
 from ...formats.errors import InputError
 from ..config import STAGES
 from ..run.folder import RunFolder, load_records
-from ..run.lock import load_run_progress
+from ..run.progress import load_run_progress
 from ..system.progress import log
 from ..system.wording import quoted
 from .scene import ViewerScene, load_scenes

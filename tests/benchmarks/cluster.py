@@ -28,19 +28,23 @@ os.environ["PYTHONPATH"] = str(ROOT)  # of the nodes, as an installed program is
 os.environ["RAY_memory_monitor_refresh_ms"] = "0"  # noqa: SIM112  Ray writes it so
 os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112  with its 15 anything else starves the tasks
 
+from msgs_slam.formats.reading import file_sha256
 from msgs_slam.pipelines.config import STAGES
-from msgs_slam.pipelines.demo import unpack_demo_clip
-from tests.benchmarks.shards import begin, beginning, contents, msgs_slam
+from msgs_slam.pipelines.evaluation.demo import unpack_demo_clip
 
 WITH_TASKS = {
-    "frames": "snapshot/extract_features.npz",
+    "frames": "snapshot",
     "proxy": "snapshot",
     "mapping": "snapshot",
     "global_ba": "snapshot/submaps",
-    "export": "snapshot/draw_views.npz",
+    "export": "snapshot/mesh",
 }
 """Stages that submit tasks, and what of their unfinished folder is there once they have."""
-SETTINGS = ("global_ba.joint=always",)
+SETTINGS = (
+    "run.threads=1", "frames.rate=4", "frames.max_features=600", "proxy.stereo_side=96", "proxy.stereo_planes=24",
+    "mapping.passes=1", "mapping.min_iterations=20", "mapping.max_side=160", "mapping.submap=6", "export.voxel=0.03",
+    "global_ba.joint=always",
+)  # fmt: skip
 """The clip has no loops, without which nothing would be refined by global_ba."""
 BETWEEN_KILLS = (0.05, 0.6)
 """Seconds."""
@@ -51,6 +55,22 @@ BAD = {
 }
 """What makes a node bad, in a shell of its own mount and host names (unshare, for which one has to be root)."""
 EXPORTS = {"trajectory": "export/trajectory.txt", "map": "export/point_cloud.ply", "mesh": "export/mesh.ply"}
+
+
+def msgs_slam(*arguments: object) -> list[str]:
+    """The command, for subprocess."""
+    return [sys.executable, "-m", "msgs_slam", *map(str, arguments)]
+
+
+def beginning(video: Path, run: Path) -> list[str]:
+    """The command that reconstructs the clip."""
+    return msgs_slam("reconstruct", video, "--out", run, *(part for text in SETTINGS for part in ("--set", text)))
+
+
+def contents(run: Path) -> dict[str, str]:
+    """Digest of every file that the stages have left."""
+    files = (p for stage in STAGES for p in (run / stage).rglob("*") if p.is_file())
+    return {str(p.relative_to(run)): file_sha256(p) for p in files}
 
 
 def add_bad_node(cluster: Any, bad: str, run: Path) -> subprocess.Popen[bytes]:
@@ -65,10 +85,8 @@ def by_cluster(
     cluster: Any, video: Path, run: Path, kills: int, rng: random.Random, kill_head: str, bad: str
 ) -> dict[str, Any]:  # fmt: skip
     """One reconstruction while nodes are killed, in each stage as long as there are kills left; how it
-    ended, and how many tasks were begun again for it. A `bad` node joins in `proxy`."""
-    command = beginning(video, run, STAGES[-1], *SETTINGS)
-    command.remove("-q")  # it warns of losses
-    command += ["--engine", "ray", "--address", cluster.address]
+    ended. A `bad` node joins in `proxy`."""
+    command = [*beginning(video, run), "--engine", "ray", "--address", cluster.address]
     log, killed, due = run.with_suffix(".log"), dict.fromkeys(WITH_TASKS, 0), 0.0
     with log.open("wb") as stream:
         process = subprocess.Popen(command, cwd=ROOT, stdout=stream, stderr=stream)
@@ -92,11 +110,11 @@ def by_cluster(
             )
             killed[stage] += 1
             cluster.add_node(num_cpus=1)
-    code, text = process.wait(), log.read_text(errors="replace")
+    code = process.wait()
     if spoilt is not None:
         spoilt.terminate()
         spoilt.wait()
-    return {"exit code": code, "killed": killed, "begun again": text.count("it is begun again")}
+    return {"exit code": code, "killed": killed}
 
 
 def main() -> None:
@@ -113,7 +131,7 @@ def main() -> None:
 
     video, _ = unpack_demo_clip(arguments.work)
     whole, shared = (arguments.work / f"{name}.msgs" for name in ("whole", "cluster"))
-    begin(video, whole, STAGES[-1], *SETTINGS)
+    subprocess.run([*beginning(video, whole), "-q"], check=True, cwd=ROOT)
     shutil.rmtree(shared, ignore_errors=True)
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
     for _ in range(arguments.nodes):

@@ -1,33 +1,41 @@
-"""`msgs-slam batch`: many recordings, one table; `msgs-slam work`: the run of many processes is that of one."""
+"""`msgs-slam batch`: many recordings, one table, a process each."""
 
-import contextlib
 import importlib.util
 import json
 import os
+import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import threading
+import time
 from pathlib import Path
 
 import pytest
-from cli_runs import invoke
 from click.testing import CliRunner, Result
 
 from msgs_slam.formats import atomic
-from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.errors import InputError, RecoverableError
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.reading import file_sha256
+from msgs_slam.msgs_cli.batch import _share
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.msgs_cli.options import chosen_config, option_words
+from msgs_slam.msgs_cli.output import Output
 from msgs_slam.pipelines import batch
-from msgs_slam.pipelines.batch import DONE, ELSEWHERE, FAILED, Recording, find_recordings, reconstruct_one
+from msgs_slam.pipelines.batch import (
+    DONE,
+    ELSEWHERE,
+    FAILED,
+    Job,
+    Recording,
+    find_recordings,
+    reconstruct_one,
+    run_in_processes,
+)
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.placement import Command, CommandResult
-from msgs_slam.pipelines.engine.tasks import Shard
-from msgs_slam.pipelines.read_config import load_config, merge_settings, with_absolute_paths
-from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings
+from msgs_slam.pipelines.read_config import load_config, merge_settings
+from msgs_slam.pipelines.run.folder import RunFolder, load_settings
 from msgs_slam.pipelines.run.lock import locked
-from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.system.progress import SilentProgress, Stopped, soft_stop
+from tests.pipelines import task_calls
 from tests.pipelines.frames.conftest import QUICK, render, sideways
 
 
@@ -74,10 +82,8 @@ def test_a_failure_costs_itself_only_and_a_second_call_does_what_is_left(recordi
 
 
 def reconstruct_here(recording: Recording, **settings: object) -> str:
-    def read(base: Config | None) -> Config:
-        return load_config(None, QUICK, merge_settings(base or Config(), settings, "test"))
-
-    return reconstruct_one(recording, read, SilentProgress(), "frames")
+    config = load_config(None, QUICK, merge_settings(Config(), settings, "test"))
+    return reconstruct_one(Job(recording, config, "frames", 0, Output()), SilentProgress())
 
 
 def test_what_another_process_works_on_is_left_to_it(recordings: Path, tmp_path: Path) -> None:
@@ -91,40 +97,68 @@ def test_what_another_process_works_on_is_left_to_it(recordings: Path, tmp_path:
     assert load_settings(RunFolder(walk.run)).frames.max_side == 200
 
 
-class Failing:
-    """A placement whose processes fail before they can say why, or have said it."""
-
-    def __init__(self, is_reported: bool) -> None:
-        self.is_reported, self.words = is_reported, []  # type: ignore[var-annotated]
-
-    def run(self, commands: Sequence[Command]) -> Iterator[CommandResult]:
-        for command in commands:
-            self.words.append(command.words)
-            yield CommandResult(command, "the node node-7 does not see the run", self.is_reported)
-
-
-def test_a_process_that_could_not_say_why_has_it_written_for_it(recordings: Path, tmp_path: Path) -> None:
-    walk = find_recordings(recordings, tmp_path)[1]
-    placement = Failing(is_reported=True)
-    assert batch.run_batch([walk], placement, ["-q"]) == [walk]
-    assert placement.words == [
-        ("msgs_slam", "batch", str(recordings), "--out", str(tmp_path), "--placed", "walk", str(walk.source), "-q")
-    ]
-    assert walk.failure_file.read_text() == "the node node-7 does not see the run\n"
-    walk.failure_file.write_text("what the process said\n")
-    assert batch.run_batch([walk], placement, []) == [walk]
-    assert walk.failure_file.read_text() == "what the process said\n"
-    assert batch.run_batch([walk], Failing(is_reported=False), []) == [walk]
-    assert walk.failure_file.read_text() == "the node node-7 does not see the run\n"
+def test_a_lost_process_costs_itself_only(tmp_path: Path) -> None:
+    """It is started once more."""
+    for name in ("never", "once", "always"):
+        (tmp_path / name).mkdir()
+    tasks = [(tmp_path / "never", 0), (tmp_path / "always", 5), (tmp_path / "once", 1)]
+    ended = dict(run_in_processes(task_calls.die, tasks))
+    ended[0]()
+    ended[2]()
+    with pytest.raises(RecoverableError, match="its process was lost: ended by SIGKILL, for want of memory perhaps"):
+        ended[1]()
+    assert [len(list((tmp_path / name).iterdir())) for name in ("never", "once", "always")] == [1, 2, 2]
+    with pytest.raises(RecoverableError, match="exit code 1"):
+        next(run_in_processes(task_calls.fail, [3]))[1]()
 
 
-def test_shards_are_disjoint_and_together_all() -> None:
-    all_of_them = [Recording(str(i), Path(), Path()) for i in range(37)]
-    parts = [Shard.parse(f"{k}/16").of(all_of_them) for k in range(16)]
-    assert sorted((r for part in parts for r in part), key=lambda r: int(r.name)) == all_of_them
+def process_at(marker: Path) -> int:
+    while not marker.exists():
+        time.sleep(0.05)
+    return int(marker.read_text())
+
+
+def require_gone(process: int) -> None:
+    for _ in range(400):
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.05)
+    pytest.fail("the child still works")
+
+
+def test_a_signal_is_passed_on(tmp_path: Path) -> None:
+    marker = tmp_path / "begun"
+    thread = threading.Thread(target=lambda: (process_at(marker), os.kill(os.getpid(), signal.SIGINT)))
+    thread.start()
+    with pytest.raises(Stopped), soft_stop(lambda number: None):
+        list(run_in_processes(task_calls.wait, [marker]))
+    thread.join()
+    require_gone(process_at(marker))
+
+
+def test_a_killed_parent_leaves_no_process_behind(tmp_path: Path) -> None:
+    marker = tmp_path / "begun"
+    code = (
+        "from msgs_slam.pipelines.batch import run_in_processes\nfrom tests.pipelines import task_calls\n"
+        f"from pathlib import Path\nlist(run_in_processes(task_calls.wait, [Path({str(marker)!r})]))\n"
+    )
+    paths = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    parent = subprocess.Popen([sys.executable, "-c", code], env=paths, stderr=subprocess.DEVNULL)
+    process = process_at(marker)
+    parent.kill()
+    parent.wait()
+    require_gone(process)
+
+
+def test_shards_are_disjoint_and_together_all(recordings: Path, tmp_path: Path) -> None:
+    everything = list(range(37))
+    parts = [_share(None, None, f"{k}/16") for k in range(16)]  # type: ignore[arg-type]
+    assert sorted(n for part in parts for n in everything[part]) == everything
     for wrong in ("16/16", "-1/4", "3", "a/b", "0/0"):
-        with pytest.raises(InputError, match="K from 0 to N - 1"):
-            Shard.parse(wrong)
+        refused = run_batch(recordings, tmp_path / "runs", "--shard", wrong)
+        assert (refused.exit_code, "K from 0 to N - 1" in refused.stderr) == (2, True)
 
 
 def test_recordings_of_one_name_have_runs_of_their_own(tmp_path: Path) -> None:
@@ -171,35 +205,6 @@ def test_damaged_recordings_are_listed_with_the_reason(recordings: Path, tmp_pat
     assert ".dng files are not supported" in errors["raw"]
 
 
-def test_files_of_options_are_found_from_the_folder_of_any_node(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name in ("masks", "maps", "labels"):
-        (tmp_path / name).mkdir()
-    for name in ("cam.json", "t.gpx", "poses.txt"):
-        (tmp_path / name).write_text("")
-    (tmp_path / "all.toml").write_text('[frames]\nposes = "poses.txt"\n')
-    given = {"frames__masks": "masks", "frames__intrinsics": "cam.json#left", "export__gps": "t.gpx"}
-    given |= {"proxy__depth": "files:maps", "run__device": "cpu", "run__quality": None, "proxy__semantics": None}
-    overrides = ["proxy.semantics=files:labels", "frames.rate=3"]
-    config = chosen_config(Path("all.toml"), overrides, given)
-    words = option_words(given, overrides, config)
-    (tmp_path / "node").mkdir()
-    monkeypatch.chdir(tmp_path / "node")
-    there = CliRunner().invoke(main, ["batch", ".", "--out", "runs", *words, "--config", "../all.toml"])
-    assert "holds no video" in there.output
-    sets = [word.removeprefix("--set=") for word in words if word.startswith("--set=")]
-    rest = [word for word in words if not word.startswith("--set=")]
-    assert rest == ["--device=cpu"]
-    assert load_config(tmp_path / "all.toml", [*sets, "run.device=cpu"]) == with_absolute_paths_of(config, tmp_path)
-
-
-def with_absolute_paths_of(config: Config, folder: Path) -> Config:
-    with contextlib.chdir(folder):
-        return with_absolute_paths(config)
-
-
 def test_two_shards_write_the_table_at_the_same_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The other one writes all of its table between the last byte of this one and its renaming."""
     replace, others = atomic.os.replace, []
@@ -227,9 +232,7 @@ def test_wrong_settings_are_refused_before_anything(recordings: Path, tmp_path: 
 
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra [cluster]")
-def test_ray_places_a_process_for_each_recording(
-    recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ray_takes_the_recordings(recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))  # as an installed program is found
     found = run_batch(recordings, tmp_path / "runs", "--engine", "ray")
     assert found.exit_code == 1
@@ -237,34 +240,3 @@ def test_ray_places_a_process_for_each_recording(
         "broken": FAILED, "walk": "unfinished (frames)",
     }  # fmt: skip
     assert "broken.mp4 is a text file" in (tmp_path / "runs" / "broken.failed.txt").read_text()
-
-
-DIVIDED = ("--set", "mapping.submap=5", "--until", "mapping", "-q")
-
-
-def contents(run: Path) -> dict[str, str]:
-    files = (p for p in sorted((run / "mapping").rglob("*")) if p.is_file())
-    return {str(p.relative_to(run)): file_sha256(p) for p in files}
-
-
-def test_two_shards_at_a_time_leave_what_one_process_does(copied_run: Callable[[str], Path]) -> None:
-    """One process alone, of a share that has no task, and then two at the same time."""
-    whole, alone, both = copied_run("whole.msgs"), copied_run("alone.msgs"), copied_run("both.msgs")
-    assert invoke("resume", whole, *DIVIDED).exit_code == 0
-    for run in (alone, both):
-        assert invoke("resume", run, "--set", "mapping.submap=5", "--until", "tracking", "-q").exit_code == 0
-    found = invoke("work", alone, "--shard", "15/16", "--until", "mapping", "-q")
-    assert found.exit_code == 0, found.stderr
-    command = [sys.executable, "-m", "msgs_slam", "work", str(both), "--until", "mapping", "-q", "--shard"]
-    processes = [subprocess.Popen([*command, f"{k}/2"]) for k in range(2)]
-    assert [p.wait(timeout=300) for p in processes] == [0, 0]
-    assert load_records(RunFolder(whole))["mapping"].figures["submaps"] == 3
-    assert contents(whole) == contents(alone) == contents(both)
-    assert not (alone / ".tasks").exists()
-
-
-def test_what_cannot_be_is_refused(finished_run: object, tmp_path: Path) -> None:
-    assert "K from 0 to N - 1" in invoke("work", finished_run.folder, "--shard", "3/3").stderr  # type: ignore[attr-defined]
-    missing = invoke("work", tmp_path, "--shard", "0/3")
-    assert missing.exit_code == 1
-    assert "is not a run folder" in missing.stderr

@@ -12,9 +12,9 @@ import torch
 from click.testing import CliRunner
 
 from msgs_slam.formats.errors import install_command, install_extra
+from msgs_slam.msgs_cli.doctor import BAD, GOOD, NOTE, Finding, examine
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines import doctor
-from msgs_slam.pipelines.doctor import BAD, GOOD, NOTE, Finding, examine
 from msgs_slam.pipelines.system import device, memory
 
 

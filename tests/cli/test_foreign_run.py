@@ -13,8 +13,8 @@ from cli_runs import FinishedRun, files_below, invoke
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.reading import file_sha256
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import PROGRESS, ProgressFile
 from msgs_slam.pipelines.run.manifest import content_digest, read_manifest, write_manifest
+from msgs_slam.pipelines.run.progress import PROGRESS, ProgressFile
 from msgs_slam.pipelines.system.progress import BEGUN, SilentProgress, StageEvent
 
 SECRET = b"a file of the user, elsewhere"
@@ -73,10 +73,6 @@ def linked(name: str, *hops: str) -> Callable[[Path, Path], None]:
     return spoil
 
 
-def board_elsewhere(run: Path, outside: Path) -> None:
-    (run / ".tasks").symlink_to(outside)
-
-
 def linked_lock(run: Path, outside: Path) -> None:
     (run / ".lock").unlink(missing_ok=True)
     (run / ".lock").symlink_to(outside / "made.txt")
@@ -100,7 +96,7 @@ OWN = ("export", "{run}", "--only", "colmap")
 RENDER = ("render", "{run}", "{out}/film.avi", "--fps", "1")
 EXTEND = ("extend", "{run}", "{video}")
 EVALUATE = ("evaluate", "{run}", "--truth", "{truth}")
-RESUME, REPORT, WORK = ("resume", "{run}"), ("report", "{run}"), ("work", "{run}", "--shard", "0/1")
+RESUME, REPORT = ("resume", "{run}"), ("report", "{run}")
 
 Spoil = Callable[[Path, Path], None]
 ESCAPES: dict[str, tuple[Spoil, tuple[tuple[str, ...], ...]]] = {
@@ -120,8 +116,7 @@ ESCAPES: dict[str, tuple[Spoil, tuple[tuple[str, ...], ...]]] = {
     "a linked evaluation": (linked("evaluation"), (EVALUATE, REPORT)),
     "linked settings": (linked("run.toml"), (COLMAP, RESUME)),
     "a linked manifest": (linked("manifest.json"), (COLMAP, RESUME)),
-    "a linked lock": (linked_lock, (RESUME, OWN, WORK)),
-    "a board of tasks elsewhere": (board_elsewhere, (RESUME, WORK)),
+    "a linked lock": (linked_lock, (RESUME, OWN)),
     "a name in the manifest": (named_in_the_manifest, (RESUME, COLMAP)),
     "a linked piece": (linked_piece, (RESUME,)),
 }

@@ -9,14 +9,11 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from cli_runs import OPTIONS, FinishedRun, invoke
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines import status
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.reconstruct import made_with, reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
@@ -24,7 +21,6 @@ from msgs_slam.pipelines.run.lock import locked
 from msgs_slam.pipelines.run.manifest import keyframe_psnr
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.system.wording import figure_text
-from msgs_slam.pipelines.types import Intrinsics
 
 
 def interrupt_when(reached: Callable[[], bool], *arguments: object) -> subprocess.CompletedProcess[str]:
@@ -157,50 +153,3 @@ def test_second_process_removes_nothing(tmp_path: Path, finished_run: FinishedRu
     with pytest.raises(InputError), locked(run):
         raise InputError("no")
     assert run.root.exists()
-
-
-@pytest.mark.parametrize(
-    ("size", "keyframes", "needed"),
-    [
-        ((160, 120), 14, {"proxy": 839, "tracking": 890, "export": 959}),
-        ((320, 240), 36, {"proxy": 1028, "tracking": 980, "export": 1153}),
-        ((640, 480), 61, {"proxy": 1654, "tracking": 1007, "export": 1998}),
-        ((640, 480), 79, {"proxy": 1494, "tracking": 874, "export": 1817}),
-    ],
-)
-def test_the_memory_that_is_expected_is_about_what_runs_have_needed(
-    monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], keyframes: int, needed: dict[str, int]
-) -> None:
-    camera = Intrinsics(*size, size[0], size[0], size[0] / 2, size[1] / 2)
-    monkeypatch.setattr(
-        status,
-        "load_records",
-        lambda _: {"frames": SimpleNamespace(figures={"keyframes": keyframes, "frames": keyframes})},
-    )
-    run: Any = SimpleNamespace(load=lambda _: SimpleNamespace(intrinsics=camera))
-    for stage, megabytes in needed.items():
-        expected = status.expected_mb(stage, run, Config())
-        assert expected is not None
-        assert abs(expected / megabytes - 1) < 0.25, stage
-
-
-def test_images_larger_than_what_proxies_work_on_cost_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        status, "load_records", lambda _: {"frames": SimpleNamespace(figures={"keyframes": 40, "frames": 40})}
-    )
-
-    def expected(side: int) -> float | None:
-        camera = Intrinsics(side, side, side, side, side / 2, side / 2)
-        run: Any = SimpleNamespace(load=lambda _: SimpleNamespace(intrinsics=camera))
-        return status.expected_mb("proxy", run, Config())
-
-    assert expected(320) < expected(640) == expected(960)  # type: ignore[operator]
-
-
-def test_status_tells_the_memory_that_a_stage_may_need(finished_run: FinishedRun) -> None:
-    """Of runs of that size: the tests' own process holds more besides."""
-    stages = json.loads(invoke("status", finished_run.folder, "--json").stdout)["stages"]
-    for stage in stages:
-        assert stage["record"]["peak_memory_mb"] / 5 < stage["expected_mb"] < 1000
-    assert "expected MB" in invoke("status", finished_run.folder, "-v").stdout
-    assert "expected MB" not in invoke("status", finished_run.folder).stdout, "beside the peak it looks like a fault"

@@ -3,7 +3,6 @@
 `make test` runs this against the built wheel and says so by MSGS_SLAM_CHECKOUT; in an editable install it is the same.
 """
 
-import ast
 import importlib
 import os
 import re
@@ -21,7 +20,6 @@ import trimesh
 
 import msgs_slam
 from msgs_slam.pipelines.config import EXPORTS, STAGES
-from msgs_slam.pipelines.engine.tasks import TASK_MODULES
 
 PROGRAM = Path(sys.executable).with_name("msgs-slam")
 PACKAGE = Path(importlib.import_module("msgs_slam.pipelines").__file__ or "").parents[1]
@@ -100,24 +98,6 @@ def test_names_of_modules_in_strings_are_modules() -> None:
     known = {module_of(path) for path in sources()} | {"msgs_slam.msgs_cli.log_format"}
     assert named
     assert named <= known
-    assert set(TASK_MODULES) <= known
-
-
-def test_every_task_is_defined_where_workers_look_for_it() -> None:
-    """What is handed to `in_chunks`, `in_frames` or `each` by name must be found by another process."""
-    defined = {
-        node.name
-        for name in TASK_MODULES
-        for node in ast.parse(Path(importlib.import_module(name).__file__ or "").read_text(encoding="utf-8")).body
-        if isinstance(node, ast.FunctionDef)
-    }
-    for path in sources():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            called = ast.unparse(node.func).split(".")[-1] if isinstance(node, ast.Call) else ""
-            if isinstance(node, ast.Call) and called in ("in_chunks", "in_frames", "each"):
-                work = node.args[0 if called == "each" else 1]
-                if isinstance(work, ast.Name) and work.id != "work":
-                    assert work.id in defined, f"{path}:{node.lineno}"
 
 
 def test_the_demo_ends_with_every_file(demo: Path) -> None:

@@ -15,7 +15,7 @@ from msgs_slam.formats.image_folder import list_images
 from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.formats.video import VideoReader
 from msgs_slam.formats.video_writer import write_video
-from msgs_slam.pipelines.demo import TRUTH, VIDEO, demo_summary, run_demo, unpack_demo_clip
+from msgs_slam.pipelines.evaluation.demo import TRUTH, VIDEO, demo_summary, run_demo, unpack_demo_clip
 from msgs_slam.pipelines.evaluation.image_quality import psnr
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder, load_records

@@ -17,7 +17,8 @@ from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.files import BACKBONE, FRAMES, MAP, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import ProgressFile, locked
+from msgs_slam.pipelines.run.lock import locked
+from msgs_slam.pipelines.run.progress import ProgressFile
 from msgs_slam.pipelines.system.progress import BEGUN, SilentProgress, StageEvent
 from msgs_slam.pipelines.viewer import live
 from msgs_slam.pipelines.viewer.live import progress_summary

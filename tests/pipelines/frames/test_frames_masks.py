@@ -138,7 +138,7 @@ def test_who_crosses_the_picture_is_left_out(
         image = read_rgb(path)
         image[left_out] = bluish(image[left_out])
         write_rgb(path, image)
-    context = replace(make_context(pictures), workers=Travelling(tmp_path, 2))
+    context = replace(make_context(pictures), workers=Travelling(2))
     figures = run(context)
     assert figures["people_still"] == 0 < figures["people_named"]
     assert figures["masked_frames"] == len(covered)

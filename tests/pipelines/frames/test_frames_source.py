@@ -237,7 +237,7 @@ def test_a_list_of_videos_never_enters_what_is_not_their_run(tmp_path: Path) -> 
         one_source(paths, run)
     assert [p.name for p in run.root.iterdir()] == ["letter.txt"]
     (run.root / "letter.txt").unlink()
-    for name in (".source.tmp.videos", ".source.tmp-0123abcd-77.videos", ".leader-0123abcd-77"):
+    for name in (".source.tmp.videos", ".source.tmp-0123abcd-77.videos"):
         (run.root / name).write_text("a half")  # left by a process that was killed
     source = one_source(paths, run)
     assert source.read_text() == "".join(f"{path.resolve()}\n" for path in paths)

@@ -73,7 +73,7 @@ def test_workers_leave_the_same_bytes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sfm, "windows_of", lambda count, _: windows_of(count, 7, 3))
-    whole, workers = make_context(bent_walk.folder, name="whole"), Travelling(tmp_path, 2)
+    whole, workers = make_context(bent_walk.folder, name="whole"), Travelling(2)
     divided = replace(make_context(bent_walk.folder, name="divided"), workers=workers)
     assert run(divided) == run(whole)
     assert digests(divided.folder) == digests(whole.folder)

@@ -85,7 +85,7 @@ def test_workers_leave_the_same_export(
     finished: tuple[RunFolder, dict, dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Grid.regions, "__defaults__", (100,))  # blocks of a region
-    workers, made = Travelling(tmp_path, 2), []
+    workers, made = Travelling(2), []
     for name, by in (("whole", None), ("divided", workers)):
         (tmp_path / name).mkdir()
         alike = replace(context(finished[0], "export"), folder=tmp_path / name, workers=by)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from test_proxy_networks import linear_head, stand_in, write_card
 
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.pipelines.demo import known_view
+from msgs_slam.pipelines.evaluation.demo import known_view
 from msgs_slam.pipelines.networks.check import KnownView, check_network
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.system.wording import BAD, GOOD, NOTE

@@ -210,7 +210,7 @@ def test_workers_leave_the_same_bytes(
     if given == "fused":
         settings += ("proxy.depth=files", "proxy.fuse=always", f"proxy.semantics={card(tmp_path / 'network')}")
     whole, divided = make_context(*settings), make_context(*settings, name="divided")
-    workers = Travelling(tmp_path, 2)
+    workers = Travelling(2)
     object.__setattr__(divided, "source", whole.source)
     object.__setattr__(divided, "workers", workers)
     assert run(divided) == run(whole)

@@ -1,123 +1,112 @@
-"""One process leads a run, on a disk without locks too; what a dead one leaves stops nobody."""
+"""One process works on a run, on a disk without locks too; what a dead one leaves stops no other."""
 
 import errno
 import fcntl
-import json
 import os
+import platform
 import subprocess
 import sys
-import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
 import pytest
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.run import lock
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import LEADER, SILENT, RunBusyError, is_led, leading, locked
+from msgs_slam.pipelines.run.lock import LOCK, SOFT_LOCK, RunBusyError, is_locked, locked
 
 
-@pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
-    """On a disk that answers as NFS without its lock daemon does."""
+def no_locks(*_: object) -> None:
+    """As NFS without its lock daemon."""
+    raise OSError(errno.ENOLCK, "No locks available")
 
-    def no_locks(*_: object) -> None:
-        raise OSError(errno.ENOLCK, "No locks available")
 
-    monkeypatch.setattr("fcntl.flock", no_locks)
+@pytest.fixture(params=["locks", "no locks"])
+def run(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunFolder:
+    if request.param == "no locks":
+        monkeypatch.setattr("fcntl.flock", no_locks)
     return RunFolder(tmp_path / "run.msgs")
 
 
-def test_two_cannot_lead_where_there_are_no_locks(run: RunFolder) -> None:
+def test_a_second_process_is_refused_and_told_of_the_first(run: RunFolder) -> None:
     run.root.mkdir()
-    with locked(run):
-        with pytest.raises(RunBusyError), locked(run):
-            pass
-        assert (run.root / LEADER).exists()
-    assert [p.name for p in run.root.iterdir()] == [".lock"]
-    with locked(run):
-        pass
+    for _ in range(2):
+        assert not is_locked(run)
+        with locked(run):
+            assert is_locked(run)
+            with pytest.raises(RunBusyError) as refused, locked(run):
+                pass
+            assert str(os.getpid()) in str(refused.value)
+            assert platform.node() in str(refused.value)
+    with pytest.raises(InputError, match="of the work"), locked(run):
+        raise InputError("of the work")
+    assert not is_locked(run)
+    assert {p.name for p in run.root.iterdir()} <= {LOCK}
 
 
-def test_an_error_of_the_leader_gives_the_lead_up(run: RunFolder) -> None:
-    run.root.mkdir()
-    with pytest.raises(InputError, match="no"), locked(run):
-        raise InputError("no")
-    with locked(run):
-        pass
-
-
-LEADS = """
-import os, sys
+HOLDS = """
+import errno, os, sys
 from pathlib import Path
-from msgs_slam.pipelines.run.lock import leading
-with leading(Path(sys.argv[1])) as led:
-    os._exit(0 if led else 1)
+if sys.argv[2] == "no locks":
+    def flock(*_): raise OSError(errno.ENOLCK, "No locks available")
+    import fcntl
+    fcntl.flock = flock
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.lock import locked
+with locked(RunFolder(Path(sys.argv[1]))):
+    os.kill(os.getpid(), 9)
 """
 
 
-def leave(path: Path) -> None:
-    """As a process that is killed while it leads."""
-    subprocess.run([sys.executable, "-c", LEADS, path], check=True)
+@pytest.mark.parametrize("kind", ["locks", "no locks"])
+def test_the_lock_of_a_killed_process_is_free_at_once(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = RunFolder(tmp_path / "run.msgs")
+    run.root.mkdir()
+    subprocess.run([sys.executable, "-c", HOLDS, str(run.root), kind], check=False)
+    assert (run.root / (LOCK if kind == "locks" else SOFT_LOCK)).exists()
+    if kind == "no locks":
+        monkeypatch.setattr("fcntl.flock", no_locks)
+    with locked(run):
+        pass
 
 
-def test_the_lead_of_a_killed_process_is_free_at_once(tmp_path: Path) -> None:
-    leave(tmp_path / LEADER)
-    assert (tmp_path / LEADER).exists()
-    with leading(tmp_path / LEADER) as led:
-        assert led
-
-
-def test_another_machine_is_dead_when_it_is_silent(tmp_path: Path) -> None:
-    path = tmp_path / LEADER
-    leave(path)
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"mark": "elsewhere"}))
-    with leading(path) as led:
-        assert not led
-    os.utime(path, (time.time() - SILENT - 5,) * 2)
-    with leading(path) as led:
-        assert led
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_leader_that_was_taken_for_dead_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lock, "BEAT", 0.01)
-    with leading(tmp_path / LEADER):
-        (tmp_path / LEADER).write_text("another's")
-        with pytest.raises(KeyboardInterrupt):
-            time.sleep(10)
-    assert (tmp_path / LEADER).read_text() == "another's"
-
-
-def test_a_leader_gives_signs_of_life(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lock, "BEAT", 0.01)
-    with leading(tmp_path / LEADER):
-        os.utime(tmp_path / LEADER, (0, 0))
-        while (tmp_path / LEADER).stat().st_mtime == 0:
-            time.sleep(0.01)
-
-
-def test_a_network_disk_that_locks_only_what_may_be_written_knows_its_leader(
+def test_without_locks_a_process_of_another_machine_is_named_with_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As NFS answers on Linux (flock(2))."""
-    flock = fcntl.flock
+    monkeypatch.setattr("fcntl.flock", no_locks)
+    run = RunFolder(tmp_path)
+    (tmp_path / SOFT_LOCK).write_text("4711\nelsewhere\n")
+    named = rf"4711 elsewhere.*if it has been killed .* delete .*{SOFT_LOCK}"
+    with pytest.raises(RunBusyError, match=named), locked(run):
+        pass
 
-    def of_nfs(stream: IO[bytes], operation: int) -> None:
+
+def of_nfs(flock: Callable[..., None]) -> Callable[..., None]:
+    """As NFS answers on Linux (flock(2)): it locks only what may be written."""
+
+    def answer(stream: IO[bytes] | int, operation: int) -> None:
         if fcntl.fcntl(stream, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
             raise OSError(errno.EBADF, "Bad file descriptor")
         flock(stream, operation)
 
-    monkeypatch.setattr("fcntl.flock", of_nfs)
+    return answer
+
+
+def test_a_network_disk_that_locks_only_what_may_be_written_knows_its_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fcntl.flock", of_nfs(fcntl.flock))
     run = RunFolder(tmp_path / "run.msgs")
-    assert not is_led(run)
+    assert not is_locked(run)
     with locked(run):
-        assert is_led(run)
-    assert not is_led(run)
+        assert is_locked(run)
+    assert not is_locked(run)
 
 
-def test_a_run_that_may_only_be_read_knows_its_leader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_may_only_be_read_knows_its_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run, opened = RunFolder(tmp_path / "run.msgs"), Path.open
 
     def refused(path: Path, mode: str = "r", **more: object) -> IO[bytes]:
@@ -127,4 +116,4 @@ def test_a_run_that_may_only_be_read_knows_its_leader(tmp_path: Path, monkeypatc
 
     with locked(run):
         monkeypatch.setattr(Path, "open", refused)
-        assert is_led(run)
+        assert is_locked(run)

@@ -11,10 +11,11 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines import reconstruct
 from msgs_slam.pipelines.config import STAGES, Config
 from msgs_slam.pipelines.engine.stages import Stage, StageContext
-from msgs_slam.pipelines.run import ending, lock
+from msgs_slam.pipelines.engine.status import run_status
+from msgs_slam.pipelines.run import ending, progress
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import PROGRESS, RunProgress, is_led, load_run_progress, locked
-from msgs_slam.pipelines.status import run_status
+from msgs_slam.pipelines.run.lock import is_locked, locked
+from msgs_slam.pipelines.run.progress import PROGRESS, RunProgress, load_run_progress
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 States = list[tuple[str, ...]]
@@ -49,7 +50,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> States:
         right(folder)
 
     monkeypatch.setattr(ending, "_flush_folder", flush)
-    monkeypatch.setattr(lock, "_BETWEEN_WRITES", 0.0)
+    monkeypatch.setattr(progress, "_BETWEEN_WRITES", 0.0)
     monkeypatch.setattr(reconstruct, "all_stages", lambda method: [Stage(name, run) for name in STAGES])
     return found
 
@@ -77,6 +78,6 @@ def test_what_a_killed_process_has_noted_does_not_run(seen: States, source: Path
         assert run_status(run).stages[1].state_text == "running, depth 75 %, about 4 min left"
         (run.root / PROGRESS).write_text("{")
         assert run_status(run).stages[1].state == "interrupted"
-    assert not is_led(run)
+    assert not is_locked(run)
     shutil.rmtree(run.root)
-    assert not is_led(run)
+    assert not is_locked(run)

@@ -7,9 +7,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from msgs_slam.msgs_cli.output import BarProgress
-from msgs_slam.pipelines.config import Config, RunConfig
-from msgs_slam.pipelines.engine.time_left import USUAL, TimeLeft, Work, machine_speed, work_of
-from msgs_slam.pipelines.read_config import load_config
+from msgs_slam.pipelines.engine.time_left import TimeLeft
 from msgs_slam.pipelines.system.progress import (
     BEGUN,
     ENDED,
@@ -45,39 +43,6 @@ def test_time_left_follows_what_stages_have_taken(monkeypatch: pytest.MonkeyPatc
     assert resumed.left() == 0
     resumed.begin("proxy")
     assert resumed.left() == pytest.approx(2 * (33 + 5)), "what is made again does not count as done"
-
-
-def test_work_grows_with_what_there_is_to_do() -> None:
-    figures = {"images": 300, "frames": 100, "keyframes": 46, "width": 640, "height": 480}
-    one = Config(run=RunConfig(threads=1, device="cpu"))
-    four = load_config(overrides=["run.threads=4"], base=one)
-    usual = work_of(one, figures)
-    assert usual.text == "46 keyframes at 640 px"
-    draft = work_of(load_config(base=one, quality="draft"), figures)
-    assert draft.text == "46 keyframes at 320 px"
-    for name, seconds in usual.seconds.items():
-        assert 0 < draft.seconds[name] <= seconds
-        assert 0.4 * seconds < work_of(four, figures).seconds[name] < seconds
-        assert work_of(one, figures | {"keyframes": 92, "frames": 200, "images": 600}).seconds[name] > 1.7 * seconds
-    assert work_of(one, {"keyframes": 46}) == USUAL, "a run of an earlier version"
-    assert work_of(load_config(overrides=["run.method=paper"], base=one), figures) == USUAL
-    said = StageEvent("frames", 1, 6, ENDED, 60.0, {}, lambda: 360.0, usual.text)
-    assert said.left_text == "; about 6 min left on this machine: 46 keyframes at 640 px"
-
-
-def test_the_machine_is_measured_once_and_what_it_does_then_counts_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    speeds = iter([2.0])
-    monkeypatch.setattr("msgs_slam.pipelines.engine.time_left.machine_speed", lambda: next(speeds))
-    left = TimeLeft(
-        {"frames": 500.0}, ("frames", "proxy", "mapping"), Work({"frames": 50, "proxy": 80, "mapping": 120})
-    )
-    for _ in range(2):
-        left.measure()
-    left.begin("proxy")
-    assert left.left() == pytest.approx(400, abs=1), "hard images do not make the rest slow"
-    left.end("proxy", 240.0)
-    assert left.left() == pytest.approx(120 * (240 + 2 * 40) / (80 + 40)), "slower than measured"
-    assert 0 < machine_speed() < 1000
 
 
 def test_words_for_a_time() -> None:

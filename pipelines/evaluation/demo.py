@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..formats.atomic import write_bytes
-from ..formats.datasets import open_sequence
-from ..formats.errors import InputError
-from ..formats.images import write_rgb
-from ..formats.video import VideoReader
-from .evaluation.write import write_evaluation
-from .networks.check import KnownView
-from .run.folder import RunFolder
-from .system.progress import Progress
-from .types import Intrinsics
+from ...formats.atomic import write_bytes
+from ...formats.datasets import open_sequence
+from ...formats.errors import InputError
+from ...formats.images import write_rgb
+from ...formats.video import VideoReader
+from ..networks.check import KnownView
+from ..run.folder import RunFolder
+from ..system.progress import Progress
+from ..types import Intrinsics
+from .write import write_evaluation
 
 VIDEO, TRUTH, RUN = "room.mp4", "room_truth", "room.msgs"
 CLIP = Path(__file__).with_name("demo_clip")

@@ -1,4 +1,4 @@
-"""Commands that look at a run: status, evaluate, report, render, view."""
+"""Commands on the results of a run: status, evaluate, report, render, view."""
 
 import json
 import re
@@ -18,8 +18,8 @@ from .output import Output, on_sigterm, say, verbosity_options
 @click.option("--json", "as_json", is_flag=True, help="The same for programs, with every figure.")
 def status(run_path: Path, verbose: bool, as_json: bool) -> None:
     """Say which stages of RUN are done, what they found, what was degraded, and which files are damaged."""
+    from ..pipelines.engine.status import run_status
     from ..pipelines.reconstruct import all_stages
-    from ..pipelines.status import run_status
     from .output import scale_lines, status_table, warning_lines
 
     run = open_run(run_path)
@@ -29,7 +29,6 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
         return
     say(f"{run.root}: made from {found.source}\n")
     say(status_table(found.stages, verbose))
-    say(found.memory)
     records = {s.name: s.record for s in found.stages if s.record}
     whole = {s.name: s.record for s in found.stages if s.record and not s.damaged}
     for line in scale_lines(run.root, whole):

@@ -1,4 +1,4 @@
-"""Check of this machine: a line for each thing the program needs, and what to do where it is missing."""
+"""`msgs-slam doctor`: a line for each thing the program needs, and what to do where it is missing."""
 
 import importlib
 import importlib.metadata
@@ -6,17 +6,17 @@ import importlib.util
 import os
 import platform
 import shutil
+import sys
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
+import click
 
 from ..formats.errors import install_command, install_extra
-from .system.device import unused_card
-from .system.memory import available_cpus, machine_memory
-from .system.wording import BAD, GOOD, NOTE, Finding
+from ..pipelines.system.wording import BAD, GOOD, NOTE, Finding
+from .output import say
 
 DISTRIBUTION = "msgs-slam"
 _MODULES = (
@@ -24,6 +24,27 @@ _MODULES = (
 )  # fmt: skip
 _MIN_MEMORY, _MIN_DISK = 4.0, 3.0
 """Gigabytes: the largest run of the benchmarks peaks at 1.8 and fills 0.5."""
+
+
+@click.command()
+def doctor() -> None:
+    """Check this machine and suggest fixes.
+
+    Exit code 1 where something would keep a reconstruction from running.
+    """
+    findings = examine(Path("."))
+    print_findings(findings)
+    if any(f.state == BAD for f in findings):
+        sys.exit(1)
+
+
+def print_findings(findings: Sequence[Finding]) -> None:
+    """Print a line for each finding, another for what to do."""
+    width = max(len(f.name) for f in findings)
+    for f in findings:
+        say(f"{f.state:4}  {f.name:{width}}  {f.text}")
+        if f.fix:
+            say(f"{'':4}  {'':{width}}  fix: {f.fix}")
 
 
 def examine(folder: Path) -> list[Finding]:
@@ -96,6 +117,8 @@ def _libraries() -> Finding:
 
 def _video() -> Finding:
     """A few frames through the encoder and back."""
+    import numpy as np
+
     from ..formats.video import VideoReader
     from ..formats.video_writer import write_video
 
@@ -116,6 +139,8 @@ def _viewer() -> Finding:
 
 
 def _threads() -> Finding:
+    from ..pipelines.system.memory import available_cpus
+
     cores = available_cpus()
     limit = os.environ.get("OMP_NUM_THREADS", "")
     if limit.isdecimal() and 0 < int(limit) < cores:
@@ -127,6 +152,8 @@ def _threads() -> Finding:
 
 
 def _memory() -> Finding:
+    from ..pipelines.system.memory import machine_memory
+
     size = machine_memory() / 1e9
     if size < _MIN_MEMORY:
         fix = "--set frames.max_side=480 needs less, or take a machine with more"
@@ -136,6 +163,8 @@ def _memory() -> Finding:
 
 def _gpu() -> Finding:
     import torch
+
+    from ..pipelines.system.device import unused_card
 
     if torch.cuda.is_available():
         properties = torch.cuda.get_device_properties(0)
@@ -148,7 +177,7 @@ def _gpu() -> Finding:
 
 
 def _models() -> Finding:
-    from .networks.registry import ModelStore
+    from ..pipelines.networks.registry import ModelStore
 
     store = ModelStore.open()
     here = [model.name for model in store.models if store.is_here(model)]
@@ -159,7 +188,7 @@ def _models() -> Finding:
 
 
 def _kernels() -> Finding:
-    from .system.jit import cache_root
+    from ..pipelines.system.jit import cache_root
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

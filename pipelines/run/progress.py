@@ -1,0 +1,95 @@
+"""How far the process is that works on a run: a small file in the run, for others to read."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Iterable, Iterator, Sized
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import TypeVar
+
+from ...formats.errors import InputError
+from ...formats.textfile import read_json
+from ..system.progress import BEGUN, Progress, StageEvent, about
+from .folder import RunFolder
+from .lock import is_locked
+from .schema import dataclass_from_json
+
+T = TypeVar("T")
+PROGRESS = ".progress.json"
+_BETWEEN_WRITES = 2.0
+"""Seconds between two notes of progress."""
+
+
+@dataclass(frozen=True)
+class RunProgress:
+    """The stage that is being made; of the piece of work that it is at how much is `done`, of how many (0: unknown);
+    left: seconds to the end of all stages, 0 where nothing is known."""
+
+    stage: str
+    label: str = ""
+    done: int = 0
+    of: int = 0
+    left: float = 0.0
+
+    @property
+    def text(self) -> str:
+        """running, features 57 %, about 4 min left"""
+        share = f", {self.label} {100 * self.done // self.of} %" if self.of else ""
+        return f"running{share}" + (f", {about(self.left)} left" if self.left else "")
+
+
+class ProgressFile:
+    """Shows what another one shows, and notes it in the run while a stage is being made, seldom enough to cost nothing.
+    The file goes with the block."""
+
+    def __init__(self, progress: Progress, run: RunFolder) -> None:
+        self._progress, self._file = progress, run.path(PROGRESS)
+        self._event: StageEvent | None = None
+        self._written = 0.0
+
+    def __enter__(self) -> ProgressFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(OSError):
+            self._file.unlink(missing_ok=True)
+
+    def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+        """Yield the items, and write how many are done to the file every so often."""
+        of = total or (len(items) if isinstance(items, Sized) else 0)
+        for done, item in enumerate(self._progress.track(items, label, total)):
+            if time.monotonic() - self._written > _BETWEEN_WRITES:
+                self._note(label, done, of)
+            yield item
+
+    def stage(self, event: StageEvent) -> None:
+        """Attribute what is tracked from now on to this stage."""
+        self._progress.stage(event)
+        self._event = event if event.state == BEGUN else self._event
+        if event.state == BEGUN:
+            self._note()
+
+    def _note(self, label: str = "", done: int = 0, of: int = 0) -> None:
+        if self._event is None:
+            return
+        self._written = time.monotonic()
+        now = RunProgress(self._event.name, label, done, of, float(self._event.left() or 0.0))
+        temporary = self._file.with_suffix(".tmp")
+        with suppress(OSError):  # the work does not stop for it
+            temporary.unlink(missing_ok=True)  # never through a link that was there
+            with temporary.open("x", encoding="utf-8") as file:
+                file.write(json.dumps(asdict(now)))
+            os.replace(temporary, self._file)
+
+
+def load_run_progress(run: RunFolder) -> RunProgress | None:
+    """Load the progress of the process at work; None where there is none, or no stage has started."""
+    path = run.path(PROGRESS)
+    if not path.exists() or not is_locked(run):
+        return None
+    with suppress(InputError, ValueError):
+        return dataclass_from_json(RunProgress, read_json(path))
+    return None
