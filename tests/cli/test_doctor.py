@@ -14,7 +14,6 @@ from click.testing import CliRunner
 from msgs_slam.formats.errors import install_command, install_extra
 from msgs_slam.msgs_cli.doctor import BAD, GOOD, NOTE, Finding, examine
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.pipelines import doctor
 from msgs_slam.pipelines.system import device, memory
 
 
@@ -36,8 +35,8 @@ def test_this_machine_can_run_the_program() -> None:
 def test_what_is_missing_is_said_with_its_fix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MSGS_SLAM_CACHE", str(tmp_path / "none"))
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    monkeypatch.setattr(doctor, "_MODULES", ("math", "no_such_module_at_all"))
-    monkeypatch.setattr(doctor, "available_cpus", lambda: 3)
+    monkeypatch.setattr("msgs_slam.msgs_cli.doctor._MODULES", ("math", "no_such_module_at_all"))
+    monkeypatch.setattr("msgs_slam.pipelines.system.memory.available_cpus", lambda: 3)
     usage = namedtuple("usage", "free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10**8))
     findings = {f.name: f for f in examine(tmp_path)}
@@ -75,7 +74,7 @@ def test_a_check_that_breaks_is_a_finding(tmp_path: Path, monkeypatch: pytest.Mo
     def broken() -> Finding:
         raise RuntimeError("no such bus")
 
-    monkeypatch.setattr(doctor, "_video", broken)
+    monkeypatch.setattr("msgs_slam.msgs_cli.doctor._video", broken)
     finding = found("video", tmp_path)
     assert finding.state == BAD
     assert "no such bus" in finding.text
