@@ -153,7 +153,7 @@ def main() -> None:
     prepare_streams()
 
 
-@main.command()
+@main.command("reconstruct")
 @click.argument("sources", metavar="SOURCE...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--out", "-o", type=FOLDER, metavar="RUN", help="The run folder. Default: the source's name + .msgs, here."
@@ -164,7 +164,7 @@ def main() -> None:
 @hold_out_option
 @engine_options("local: all in this process; ray: keyframes' depths and submaps on the nodes of a cluster.")
 @verbosity_options
-def reconstruct(
+def reconstruct_command(
     sources: tuple[Path, ...],
     out: Path | None,
     config_file: Path | None,
@@ -180,9 +180,11 @@ def reconstruct(
 
     No option is needed. If interrupted, run the same command, or `msgs-slam resume RUN`, to continue; with a changed
     setting only the stages that depend on it run again.
+
+    \b
+    Example: msgs-slam reconstruct video.mp4 --quality draft
     """
-    from ..pipelines.reconstruct import default_run_folder, existing_config, one_source
-    from ..pipelines.reconstruct import reconstruct as run_reconstruct
+    from ..pipelines.reconstruct import default_run_folder, existing_config, one_source, reconstruct
     from ..pipelines.run.folder import RunFolder
 
     run = RunFolder(out) if out else default_run_folder(sources[0])
@@ -191,11 +193,11 @@ def reconstruct(
         open_cluster(engine_name, address, config, output) as workers,
         output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"),
     ):
-        records = run_reconstruct(one_source(sources, run), run, config, output.progress(), until, workers)
+        records = reconstruct(one_source(sources, run), run, config, output.progress(), until, workers)
     report_run(output, run.root, records)
 
 
-@main.command()
+@main.command("resume")
 @RUN_ARGUMENT
 @click.option(
     "--redo", type=click.Choice(STAGES),
@@ -207,7 +209,7 @@ def reconstruct(
 @UNTIL
 @engine_options("local: all in this process; ray: keyframes' depths and submaps on the nodes of a cluster.")
 @verbosity_options
-def resume(
+def resume_command(
     run_path: Path,
     redo: str | None,
     config_file: Path | None,
@@ -219,11 +221,14 @@ def resume(
     **given: str | int | None,
 ) -> None:
     """Resume RUN where it stopped. Finished stages are kept unless one of their settings is changed, or --redo names
-    them. A stage that is run again replaces its old output only if it succeeds."""
+    them. A stage that is run again replaces its old output only if it succeeds.
+
+    \b
+    Example: msgs-slam resume video.msgs --quality normal
+    """
     if redo and STAGES.index(redo) > STAGES.index(until):
         raise click.UsageError(f"--redo {redo} comes after --until {until}: nothing would be made again")
-    from ..pipelines.reconstruct import require_run
-    from ..pipelines.reconstruct import resume as run_resume
+    from ..pipelines.reconstruct import require_run, resume
     from ..pipelines.run.folder import RunFolder, load_settings
 
     run = RunFolder(run_path)
@@ -233,28 +238,31 @@ def resume(
         open_cluster(engine_name, address, config, output) as workers,
         output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"),
     ):
-        records = run_resume(run, output.progress(), config, until, workers, redo=redo or "")
+        records = resume(run, output.progress(), config, until, workers, redo=redo or "")
     report_run(output, run.root, records)
 
 
-@main.command()
+@main.command("extend")
 @RUN_ARGUMENT
 @click.argument("videos", metavar="VIDEO...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @verbosity_options
-def extend(run_path: Path, videos: tuple[Path, ...], output: Output) -> None:
+def extend_command(run_path: Path, videos: tuple[Path, ...], output: Output) -> None:
     """Add VIDEO, by the same camera and of the same place, to the finished RUN.
 
     First a few of its images are searched for in the run: if nothing matches or the camera differs, it stops and
     changes nothing. Then its frames join those of the run, whose poses are the start, all are adjusted together, and
     the map is grown where the added frames look. Coordinates stay what they were, as near as the adjustment allows.
     Stopped, the same command or `msgs-slam resume RUN` goes on.
+
+    \b
+    Example: msgs-slam extend video.msgs kitchen.mp4
     """
-    from ..pipelines.reconstruct import extend as extend_run
+    from ..pipelines.reconstruct import extend
     from ..pipelines.run.folder import RunFolder
 
     run = RunFolder(run_path)
     with output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"):
-        records = extend_run(run, videos, output.progress())
+        records = extend(run, videos, output.progress())
     report_run(output, run.root, records)
 
 
@@ -284,6 +292,9 @@ def export(
 
     Other settings than the run's own (--set export.voxel=0.02) need --to; `msgs-slam resume RUN
     --set ...` changes them in the run itself.
+
+    \b
+    Example: msgs-slam export video.msgs --only ply --to shared
     """
     if (config_file or overrides) and (to is None or to.resolve() == (run_path / "export").resolve()):
         raise click.UsageError(
@@ -330,12 +341,12 @@ def demo(
     """Reconstruct a synthetic test clip and print its errors against ground truth."""
     config = chosen_config(config_file, overrides, given)
     from ..pipelines.evaluation.demo import demo_summary, run_demo
-    from ..pipelines.reconstruct import reconstruct as run_reconstruct
+    from ..pipelines.reconstruct import reconstruct
     from ..pipelines.run.folder import RunFolder
 
     def reconstruct_clip(video: Path, run: RunFolder) -> None:
         with output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"):
-            records = run_reconstruct(video, run, config, output.progress())
+            records = reconstruct(video, run, config, output.progress())
         if not output.quiet:
             print_summary(run.root, records)
 

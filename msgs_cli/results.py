@@ -50,7 +50,11 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
 )  # fmt: skip
 @verbosity_options
 def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | None, output: Output) -> None:
-    """Compare RUN with ground truth: poses, images, depth, labels, mesh. Writes RUN/evaluation/."""
+    """Compare RUN with ground truth: poses, images, depth, labels, mesh. Writes RUN/evaluation/.
+
+    \b
+    Example: msgs-slam evaluate msgs-demo/room.msgs --truth msgs-demo/room_truth
+    """
     from ..formats.datasets import open_sequence
 
     joins = None
@@ -79,7 +83,11 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | No
 @OVERWRITE
 @verbosity_options
 def report(run_path: Path, to: Path | None, pdf: bool, overwrite: bool, output: Output) -> None:
-    """Write one HTML file that says what was found, how good it is, and what to film better."""
+    """Write one HTML file that says what was found, how good it is, and what to film better.
+
+    \b
+    Example: msgs-slam report video.msgs --to report.html
+    """
     if to is not None and to.suffix.lower() == ".pdf":
         raise click.UsageError(
             f"--to {to}: it names the HTML file, {to.with_suffix('.html')}; with --pdf the PDF is made beside it"
@@ -144,6 +152,9 @@ def render(
 
     An .mp4 is H.264 where PyAV is installed (the extra [hdr]), else VP9: browsers play both. .avi and
     .mkv are lossless (FFV1).
+
+    \b
+    Example: msgs-slam render video.msgs orbit.mp4 --path orbit
     """
     is_file = source.is_file() and source.suffix.lower() in SPLAT_FILES
     if is_file and (kind != "color" or camera_path == "own"):

@@ -46,7 +46,7 @@ _FIGURES = (("frames", "frames"), ("tracking", "posed"), ("tracking", "keyframes
 
 
 @dataclass(frozen=True)
-class Recording:
+class BatchItem:
     """A source and the folder of its run."""
 
     name: str
@@ -59,7 +59,7 @@ class Recording:
         return self.run.with_suffix(".failed.txt")
 
 
-def find_recordings(folder: Path, runs: Path) -> list[Recording]:
+def find_recordings(folder: Path, runs: Path) -> list[BatchItem]:
     """The videos, image folders and data sets directly in a folder, by name, damaged ones too: each says itself why it
     fails. Other folders are reported. Raises InputError where there is none."""
     if not folder.is_dir():
@@ -79,7 +79,7 @@ def find_recordings(folder: Path, runs: Path) -> list[Recording]:
     files = {p.name for p in sources if p.is_file()}
     clear = [stems.count(stem) == 1 and stem not in files for stem in stems]
     names = [stem if is_clear else p.name for stem, is_clear, p in zip(stems, clear, sources, strict=True)]
-    return [Recording(n, p, runs / f"{n}.msgs") for n, p in zip(names, sources, strict=True)]
+    return [BatchItem(n, p, runs / f"{n}.msgs") for n, p in zip(names, sources, strict=True)]
 
 
 def _is_run(path: Path, runs: Path) -> bool:
@@ -100,14 +100,14 @@ class Job:
     """A recording with its settings, the last stage, the CPU threads where the settings leave them open (0: all), and
     what sets logging up in the process that works on it."""
 
-    recording: Recording
+    recording: BatchItem
     config: Config
     until: str
     threads: int
-    output: Output
+    output: JobOutput
 
 
-class Output(Protocol):
+class JobOutput(Protocol):
     """Sets logging up for a named recording and returns its progress; pickled with the job."""
 
     def task_progress(self, name: str) -> Progress:
@@ -116,12 +116,12 @@ class Output(Protocol):
 
 
 def run_batch(
-    recordings: Sequence[Recording],
+    recordings: Sequence[BatchItem],
     read: Callable[[Config | None], Config],
     until: str,
-    output: Output,
+    output: JobOutput,
     cluster: RayCluster | None = None,
-) -> list[Recording]:
+) -> list[BatchItem]:
     """Bring the runs of these recordings up to date, each in a process of its own; what another process works on is
     left to it.
 
@@ -238,12 +238,12 @@ def _stop_with_parent() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _write_failure(recording: Recording, reason: str) -> None:
+def _write_failure(recording: BatchItem, reason: str) -> None:
     with unique_temp_names():  # a shard that is started twice may fail twice at the same moment
         write_text(recording.failure_file, reason.rstrip() + "\n")
 
 
-def table_row(recording: Recording) -> dict[str, Any]:
+def table_row(recording: BatchItem) -> dict[str, Any]:
     """One row of the table, from the files of the run folder: whichever process worked on it, and whenever."""
     row: dict[str, Any] = {"recording": recording.name, "state": NOT_YET}
     run = RunFolder(recording.run)

@@ -17,6 +17,7 @@ from ..config import STAGES, Config
 from ..run.ending import FINGERPRINT, empty, find_sealed, move_in, results, seal, unseal
 from ..run.folder import RunFolder, load_records, load_stale, save_settings
 from ..run.manifest import Manifest, Source, StageRecord, content_digest, finite_or_none, settings_of, write_manifest
+from ..run.progress import TimeLeft
 from ..system.memory import release_free_memory
 from ..system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log, stop_if_asked
 from ..system.wording import quoted
@@ -29,7 +30,6 @@ from .staleness import (
     stage_fingerprint,
 )
 from .tasks import limit_threads
-from .time_left import TimeLeft
 
 _PROCESS = Path("/proc/self")
 

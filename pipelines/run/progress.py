@@ -1,13 +1,13 @@
-"""How far the process is that works on a run: a small file in the run, for others to read."""
+"""How far the process is that works on a run, in a small file for others to read, and how long the rest will take."""
 
 from __future__ import annotations
 
 import json
 import os
 import time
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TypeVar
 
 from ...formats.errors import InputError
@@ -21,6 +21,8 @@ T = TypeVar("T")
 PROGRESS = ".progress.json"
 _BETWEEN_WRITES = 2.0
 """Seconds between two notes of progress."""
+_SHARES = {"frames": 16, "proxy": 33, "tracking": 5, "mapping": 37, "global_ba": 1, "export": 8}
+"""Of the seconds of a run: the median of five recordings (two rooms, the demo, two walks)."""
 
 
 @dataclass(frozen=True)
@@ -93,3 +95,35 @@ def load_run_progress(run: RunFolder) -> RunProgress | None:
     with suppress(InputError, ValueError):
         return dataclass_from_json(RunProgress, read_json(path))
     return None
+
+
+@dataclass
+class TimeLeft:
+    """Time left for the stages `wanted`, in order: what the stages that are done, by this process or another, have
+    taken in `seconds` tells how fast it goes here. As long as no stage is done nothing is known."""
+
+    seconds: dict[str, float]
+    wanted: Sequence[str]
+    _waiting: list[str] = field(default_factory=list)
+    _begun: float | None = None
+
+    def begin(self, name: str) -> None:
+        """Note that this stage begins: it and those after it are to be made."""
+        self._waiting, self._begun = list(self.wanted[self.wanted.index(name) :]), time.monotonic()
+        self.seconds = {k: v for k, v in self.seconds.items() if k not in self._waiting}
+
+    def end(self, name: str, seconds: float) -> None:
+        """Note that this stage has ended."""
+        self.seconds[name], self._begun = seconds, None
+        self._waiting.remove(name)
+
+    def left(self) -> float | None:
+        """Seconds to the end of all, by the time that it is now; None where nothing is known."""
+        if not self.seconds:
+            return None
+        speed = sum(self.seconds.values()) / sum(_SHARES[name] for name in self.seconds)
+        expected = [speed * _SHARES[name] for name in self._waiting]
+        if self._begun is not None:
+            # A stage that takes longer than estimated has still some of its time to go.
+            expected[0] = max(expected[0] - (time.monotonic() - self._begun), 0.1 * expected[0])
+        return sum(expected)

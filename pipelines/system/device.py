@@ -20,7 +20,7 @@ def resolve_device(wanted: str = "auto") -> str:
         )
     if wanted != "auto":
         return wanted
-    return _told("cuda" if found else "cpu")
+    return _log_once("cuda" if found else "cpu")
 
 
 def require_device(wanted: str) -> None:
@@ -46,7 +46,7 @@ def unused_card() -> tuple[str, str] | None:
 
 
 @functools.cache
-def _told(device: str) -> str:
+def _log_once(device: str) -> str:
     log.info("device: %s", device)  # once
     if device == "cpu" and (unused := unused_card()):
         log.warning("%s. To use the card: %s", *unused)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from threading import Lock
@@ -15,32 +15,23 @@ K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 R = TypeVar("R")
 LOOKAHEAD = 2
-"""Things of which each already has its loops on all threads: the second is there for what of the first has not."""
+"""Items in work at once. Each item is multithreaded itself; a second one fills the first one's serial gaps."""
 
 
-def parallel_map(function: Callable[[T], R], items: Iterable[T], threads: int) -> Iterator[R]:
-    """`map` on threads, in order; at most a few results wait in memory."""
-    items = iter(items)
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        waiting = [pool.submit(function, item) for item in itertools.islice(items, 2 * max(1, threads))]
+def parallel_map(function: Callable[[T], R], items: Iterable[T], threads: int, begun: int = 0) -> Iterator[R]:
+    """`map` on threads, in order; at most `begun` items (0: two a thread) are in work or wait in memory."""
+    items, threads = iter(items), max(1, threads)
+    with ThreadPoolExecutor(threads) as pool:
+        waiting = deque(pool.submit(function, item) for item in itertools.islice(items, begun or 2 * threads))
         while waiting:
-            yield waiting.pop(0).result()
+            result = waiting.popleft().result()
             waiting.extend(pool.submit(function, item) for item in itertools.islice(items, 1))
+            yield result
 
 
 def map_lookahead(function: Callable[[T], R], items: Iterable[T], threads: int) -> Iterator[R]:
-    """`map`, in order, with `LOOKAHEAD` of them in work where there is more than one thread; none is begun before those
-    are done that come `LOOKAHEAD` before it, so that no more than these need memory."""
-    if threads < LOOKAHEAD:
-        yield from map(function, items)
-        return
-    items = iter(items)
-    with ThreadPoolExecutor(LOOKAHEAD) as pool:
-        waiting = [pool.submit(function, item) for item in itertools.islice(items, LOOKAHEAD)]
-        while waiting:
-            result = waiting.pop(0).result()
-            waiting.extend(pool.submit(function, item) for item in itertools.islice(items, 1))
-            yield result
+    """`map`, in order, with `LOOKAHEAD` items in work where there is more than one thread: no more need memory."""
+    return parallel_map(function, items, LOOKAHEAD, LOOKAHEAD) if threads >= LOOKAHEAD else map(function, items)
 
 
 class LruCache(Generic[K, R]):

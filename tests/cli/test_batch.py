@@ -24,8 +24,8 @@ from msgs_slam.pipelines.batch import (
     DONE,
     ELSEWHERE,
     FAILED,
+    BatchItem,
     Job,
-    Recording,
     find_recordings,
     reconstruct_one,
     run_in_processes,
@@ -81,7 +81,7 @@ def test_a_failure_costs_itself_only_and_a_second_call_does_what_is_left(recordi
     assert {name: row["state"] for name, row in rows(runs).items()} == {"broken": FAILED, "walk": "unfinished (frames)"}
 
 
-def reconstruct_here(recording: Recording, **settings: object) -> str:
+def reconstruct_here(recording: BatchItem, **settings: object) -> str:
     config = load_config(None, QUICK, merge_settings(Config(), settings, "test"))
     return reconstruct_one(Job(recording, config, "frames", 0, Output()), SilentProgress())
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from msgs_slam.msgs_cli.output import BarProgress
-from msgs_slam.pipelines.engine.time_left import TimeLeft
+from msgs_slam.pipelines.run.progress import TimeLeft
 from msgs_slam.pipelines.system.progress import (
     BEGUN,
     ENDED,
