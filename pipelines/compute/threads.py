@@ -83,7 +83,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """As `pipelines.system.jit.kernel`, with fused sums."""
+    """Compile as `pipelines.system.jit.kernel` does, with fused sums."""
     compiled: Callable[..., Any] = jit.kernel(function, **_OPTIONS)
     return compiled
 
@@ -104,6 +104,6 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """As `inner`, but always a part of its caller: a call for each of many small things costs as much as the things."""
+    """Compile as `inner` does, but always as a part of its caller: a call for each of many small things costs as much as the things."""
     called: Callable[..., Any] = register_jitable(no_cpython_wrapper=True, forceinline=True, **_OPTIONS)(function)
     return called

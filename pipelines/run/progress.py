@@ -1,4 +1,4 @@
-"""How far the process is that works on a run, in a small file for others to read, and how long the rest will take."""
+"""Progress of the process that works on a run, in a small file for others to read, and the time that is left."""
 
 from __future__ import annotations
 

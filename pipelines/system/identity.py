@@ -1,4 +1,4 @@
-"""What code a result was made by: one digest of the program, which cannot be forgotten when the code changes.
+"""Digest of the program that made a result: it cannot be forgotten when the code changes.
 
 Libraries are not part of it: another numpy or COLMAP may give other bytes, and does not make a run out of date.
 """
