@@ -104,6 +104,6 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile as `inner` does, but always as a part of its caller: a call for each of many small things costs as much as the things."""
+    """Compile as `inner` does, but always as a part of its caller: many small calls cost as much as their work."""
     called: Callable[..., Any] = register_jitable(no_cpython_wrapper=True, forceinline=True, **_OPTIONS)(function)
     return called
