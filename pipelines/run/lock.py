@@ -62,9 +62,7 @@ def _acquire(run: RunFolder) -> BaseFileLock:
         with suppress(OSError):
             path.write_text(f"process {os.getpid()} on {platform.node()}", encoding="utf-8")
     except Timeout as error:
-        raise RunBusyError(
-            f"{run.root}: another msgs-slam process is working on this run ({_holder(path)}). Wait for it to end"
-        ) from error
+        raise _busy(run, path) from error
     except OSError as error:
         if error.errno not in _NO_LOCKS:
             raise InputError(
@@ -74,17 +72,17 @@ def _acquire(run: RunFolder) -> BaseFileLock:
             lock = SoftFileLock(soft, timeout=_WAITS)
             lock.acquire()
         except Timeout as busy:
-            raise RunBusyError(
-                f"{run.root}: another msgs-slam process is working on this run ({_holder(soft)}). Wait for it to end; "
-                f"if it has been killed on another machine, delete {soft}"
-            ) from busy
+            raise _busy(run, soft, f"; if it has been killed on another machine, delete {soft}") from busy
     return lock
 
 
-def _holder(path: Path) -> str:
+def _busy(run: RunFolder, held: Path, more: str = "") -> RunBusyError:
+    holder = ""
     with suppress(OSError):
-        return " ".join(path.read_text(encoding="utf-8", errors="replace").split()) or "unknown"
-    return "unknown"
+        holder = " ".join(held.read_text(encoding="utf-8", errors="replace").split())
+    return RunBusyError(
+        f"{run.root}: another msgs-slam process is working on this run ({holder or 'unknown'}). Wait for it to end{more}"
+    )
 
 
 def is_locked(run: RunFolder) -> bool:
