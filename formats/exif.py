@@ -54,8 +54,8 @@ def lens_of(base: _Tags, tags: _Tags, size: tuple[int, int]) -> ExifLens:
     """Read the lens from EXIF's base tags and its own, of an image stored as size = (width, height)."""
     names = (_text(base.get(tag)) for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
     return ExifLens(
-        _plausible(positive(tags.get(ExifTags.Base.FocalLengthIn35mmFilm))),
-        _plausible(_by_pitch(tags, size)),
+        plausible_equivalent(positive(tags.get(ExifTags.Base.FocalLengthIn35mmFilm))),
+        plausible_equivalent(_by_pitch(tags, size)),
         positive(tags.get(ExifTags.Base.FocalLength)),
         positive(tags.get(ExifTags.Base.DigitalZoomRatio)) or 1.0,
         " ".join(name for name in names if name),
@@ -106,7 +106,8 @@ def positive(value: object) -> float | None:
     return number if math.isfinite(number) and number > 0 else None
 
 
-def _plausible(equivalent: float | None) -> float | None:
+def plausible_equivalent(equivalent: float | None) -> float | None:
+    """Return a focal length in mm at 35 mm film, None where no lens has it."""
     low, high = _EQUIVALENTS
     return equivalent if equivalent is not None and low <= equivalent <= high else None
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from PIL import Image
 
 from .errors import InputError
+from .exif import plausible_equivalent, positive
 from .reading import parsing
 
 WHOLE, PART = "equirectangular", "part of a sphere"
@@ -25,6 +26,9 @@ _COLOURS = re.compile(rb"colrncl[xc]..(..)", re.DOTALL)
 
 TRANSFERS = {16: "PQ", 18: "HLG"}
 """Of ITU-T H.273, table 3: those of HDR."""
+_EQUIVALENT = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
+_TEXT, _FLOATS = 1, {23: ">f", 24: ">d"}
+"""Types of a metadata value; others are whole numbers."""
 _IDENTITY = (1, 0, 0, 1)
 _WITH_ALPHA = 32
 """Bits of a pixel in a sample entry that has red, green, blue and alpha."""
@@ -151,6 +155,31 @@ def _shown(edits: bytes, movie_scale: int, length: int, scale: int) -> float:
         return 1.0
     shown = sum(max(0.0, min(span / movie_scale * scale, length - start)) for span, start in parts)
     return min(1.0, shown / length)
+
+
+def read_equivalent(path: Path) -> float | None:
+    """Read the focal length in mm at 35 mm film from the metadata of an MP4 or MOV or of one of its tracks (`keys` and
+    `ilst` of Apple's QuickTime File Format); None where none is stated."""
+    moov = memoryview(read_moov(path))
+    for content in (moov, *(content for kind, content in _boxes(moov) if kind in (b"trak", b"udta"))):
+        meta = memoryview(_box(content, b"meta"))
+        meta = meta if bytes(meta[4:8]) == b"hdlr" else meta[4:]  # in MP4 version and flags come first
+        keys, at, number = _box(meta, b"keys")[8:], 0, 0
+        while at + 8 <= len(keys):
+            size, number = int.from_bytes(keys[at : at + 4], "big"), number + 1
+            if keys[at + 8 : at + size] == _EQUIVALENT:
+                return plausible_equivalent(_metadata_number(_box(meta, b"ilst", number.to_bytes(4, "big"), b"data")))
+            at += max(size, 8)
+    return None
+
+
+def _metadata_number(data: bytes) -> float | None:
+    kind, value = int.from_bytes(data[:4], "big"), data[8:]
+    if kind in _FLOATS and len(value) == struct.calcsize(_FLOATS[kind]):
+        return float(struct.unpack(_FLOATS[kind], value)[0])
+    if kind == _TEXT:
+        return positive(value)
+    return float(int.from_bytes(value, "big")) if 0 < len(value) <= 8 else None
 
 
 # Matroska and WebM -----------------------------------------------------------------------------------------------

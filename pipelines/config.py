@@ -153,7 +153,7 @@ class FramesConfig:
     )
     parallax: float = setting(
         0.025,
-        "a new keyframe when points have moved by this fraction of the image's longer side",
+        "a new keyframe when points have moved by this fraction of the image's width (up or down: of its height)",
         within=(0.001, 0.5),
         draft=0.06,
     )

@@ -87,7 +87,7 @@ def warn_of_focal(
         )
     if origin == "exif" and abs(found - known) > max(_APART * structure.focal_sd, _OFF * known):
         context.warn(
-            f"the focal length that EXIF states ({known:.0f} px) is far from what the images say ({found:.0f} ± "
+            f"the focal length that the metadata state ({known:.0f} px) is far from what the images say ({found:.0f} ± "
             f"{structure.focal_sd:.0f} px), which is used"
         )
         return "self-calibrated"

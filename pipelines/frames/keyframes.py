@@ -34,7 +34,7 @@ _MIN_SURVIVORS = 0.5
 @dataclass(frozen=True)
 class KeyframeChoice:
     """keyframes: indices of the chosen frames; displacement (N,): median displacement of each frame from the keyframe
-    before it, as a fraction of the longer side, infinite where the tracks were lost. has_detail: whether any frame has
+    before it, as a fraction of width and height, infinite where the tracks were lost. has_detail: whether any frame has
     enough corners to follow."""
 
     keyframes: list[int]
@@ -43,7 +43,7 @@ class KeyframeChoice:
 
     @property
     def largest_displacement(self) -> float:
-        """Largest displacement that was seen, as a fraction of the longer side."""
+        """Largest displacement that was seen, as a fraction of width and height."""
         return float(self.displacement.max(initial=0.0))
 
 
@@ -51,8 +51,9 @@ def choose_keyframes(
     frames: Iterable[tuple[NDArray[np.uint8], NDArray[np.bool_] | None]], parallax: float
 ) -> KeyframeChoice:
     """Keyframes of grey frames (H, W) in order of time, each with a mask (H, W) of what is no part of the scene: one
-    whenever points have moved by `parallax`, as a fraction of the longer side; the first, and the last where it adds
-    a view.
+    whenever points have moved by `parallax`, as a fraction of the width for
+    what goes sideways and of the height for what goes up, since either takes as much of the overlap; the first, and the
+    last where it adds a view.
     """
     tracker = _Tracker()
     keyframes: list[int] = []
@@ -89,7 +90,7 @@ class _Tracker:
         return self._started
 
     def advance(self, gray: NDArray[np.uint8]) -> tuple[float, float]:
-        """Median displacement since the keyframe (fraction of the longer side), and the share of its tracks alive."""
+        """Median displacement since the keyframe (fraction of width and height), and the share of its tracks alive."""
         previous, self._previous = self._previous, gray
         if previous is None:
             return 0.0, 1.0
@@ -102,8 +103,8 @@ class _Tracker:
         survivors = len(self._points) / self._started
         if len(self._points) < min(_MIN_TRACKS, self._started):
             return np.inf, survivors
-        distance = np.linalg.norm(self._points - self._origin, axis=1)
-        return float(np.median(distance)) / max(gray.shape), survivors
+        distance = np.linalg.norm((self._points - self._origin) / gray.shape[::-1], axis=1)
+        return float(np.median(distance)), survivors
 
 
 def pick_frames(context: StageContext, source: Recording, faces: Faces | None) -> list[Frame]:

@@ -26,7 +26,7 @@ _MIN_BETTER = 0.1
 """Share of the cost of all matches that goes without the prior where it was wrong."""
 _SIGNIFICANT = 3.0
 """Standard deviations between two focal lengths that contradict each other."""
-_STATED_BY = {"exif": "EXIF states", "stated": "the data set states", "self-calibrated": "the data set states"}
+_STATED_BY = {"exif": "the metadata state", "stated": "the data set states", "self-calibrated": "the data set states"}
 
 
 def solve(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ...formats.datasets import Camera, Sequence, open_sequence, recognise_source
 from ...formats.errors import InputError
+from ...formats.exif import ExifLens
 from ...formats.image_folder import list_images, read_image_times, times_file, unread_images
 from ...formats.images import Header, Reading, is_depth_map, is_plain, read_rgb, read_transparent
 from ...formats.reading import (
@@ -32,6 +33,7 @@ from ...formats.reading import (
     require_file,
 )
 from ...formats.video import VideoFrame, VideoReader, probe_video
+from ...formats.video_head import read_equivalent
 from ..run.folder import RunFolder
 from .headers import Headers, common_span, read_headers, require_one_lens
 from .videos import Warn, video_files, warn_of_video
@@ -108,7 +110,7 @@ class Recording(ABC):
         return 0
 
     def exif_focal(self) -> float | None:
-        """Return the focal length in pixels that the images state; None without."""
+        """Return the focal length in pixels that the images or videos state; None without."""
         return None
 
 
@@ -193,6 +195,11 @@ class VideoRecording(Recording):
     def name(self, frame_id: int, index: int) -> str:
         """Return 000000.jpg, 000001.jpg, ..."""
         return f"{frame_id:06d}.jpg"
+
+    def exif_focal(self) -> float | None:
+        """Do as `Recording` says: what the metadata of all files states alike."""
+        stated = {read_equivalent(file) for file in self.files}
+        return ExifLens(equivalent=stated.pop()).focal_px(self.width, self.height) if len(stated) == 1 else None
 
 
 def is_of_source(path: Path, run: RunFolder) -> bool:

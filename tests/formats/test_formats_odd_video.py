@@ -11,7 +11,7 @@ import pytest
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.video import VideoReader, pixel_aspect, probe_video
-from msgs_slam.formats.video_head import Track, main_track, read_moov, read_tracks, video_sphere
+from msgs_slam.formats.video_head import Track, main_track, read_equivalent, read_moov, read_tracks, video_sphere
 from msgs_slam.formats.video_streams import AvCapture
 from msgs_slam.pipelines.source.recording import VideoRecording
 from tests.formats.test_formats_video import encode, hdr_signal, textured, with_matrix, woven, write_hdr
@@ -403,3 +403,26 @@ def test_damaged_heads_say_nothing(tmp_path: Path, keep: int) -> None:
         start = data.index(b"moov") + 4 if suffix == ".mp4" else 30
         path.write_bytes(data[: start + keep] + noise)
         assert all(0 <= track.shown <= 1 for track in read_tracks(path))
+
+
+def test_the_lens_of_a_phone_is_read_from_its_metadata(tmp_path: Path) -> None:
+    path, key = tmp_path / "phone.mov", "com.apple.quicktime.camera.focal_length.35mm_equivalent"
+    with av.open(path, "w", options={"movflags": "use_metadata_tags"}) as container:
+        container.metadata.update({"com.apple.quicktime.model": "phone", key: "28"})
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height = 64, 48
+        for picture in np.random.default_rng(0).integers(0, 255, (2, 48, 64, 3), np.uint8):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
+    assert read_equivalent(path) == 28.0
+    assert VideoRecording(path).exif_focal() == pytest.approx(28 / 43.267 * 80, rel=1e-4)
+    data = path.read_bytes()
+    place = data.index(b"\0\0\0\x01\0\0\0\0" + b"28")
+    for value, wanted in ((b"99", 99.0), (b"\0\0", None), (b"xy", None)):
+        path.write_bytes(data[: place + 8] + value + data[place + 10 :])
+        assert read_equivalent(path) == wanted
+    path.write_bytes(data[:place] + b"\0\0\0\x16" + b"\0\0\0\0" + b"\0\x1a" + data[place + 10 :])
+    assert read_equivalent(path) == 26.0
+    path.write_bytes(data.replace(key.encode(), key.encode()[::-1]))
+    assert read_equivalent(path) is None
+    assert VideoRecording(path).exif_focal() is None

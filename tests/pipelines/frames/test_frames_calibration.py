@@ -385,7 +385,7 @@ def test_a_prior_focal_length_that_leaves_no_structure_is_dropped_before_the_ima
     assert figures["calibration"] == "self-calibrated"
     assert figures["focal_px"] == pytest.approx(bent_walk.focal, rel=0.03)
     assert figures["keyframes_placed"] == figures["keyframes"]
-    assert any("EXIF states (9 px) leaves no structure" in w for w in context.warnings)
+    assert any("the metadata state (9 px) leaves no structure" in w for w in context.warnings)
     with pytest.raises(InputError, match=r"--intrinsics \(focal length 9 px\) leaves no structure.*correct or omit it"):
         run(make_context(bent_walk.folder, "frames.intrinsics=9.2,9.2,160,120", name="held"))
 
@@ -398,7 +398,9 @@ def test_a_plausible_prior_focal_length_that_contradicts_the_images_is_dropped_a
     figures = run(context)
     assert figures["calibration"] == "self-calibrated"
     assert figures["focal_px"] == pytest.approx(bent_walk.focal, rel=0.03)
-    assert any("the focal length that EXIF states" in w and "contradicts the images" in w for w in context.warnings)
+    assert any(
+        "the focal length that the metadata state" in w and "contradicts the images" in w for w in context.warnings
+    )
 
 
 def test_a_prior_focal_length_that_the_images_agree_with_is_kept(

@@ -146,4 +146,6 @@ def test_a_known_focal_length_far_from_the_images_is_said_to_be(origin: str, sta
     else:
         assert final == ("given" if origin == "given" else "self-calibrated")
         assert len(said) == 1
-        assert ("--intrinsics (focal length 600 px) contradicts" if origin == "given" else "EXIF states") in said[0]
+        assert (
+            "--intrinsics (focal length 600 px) contradicts" if origin == "given" else "the metadata state"
+        ) in said[0]
