@@ -14,10 +14,10 @@ from ..engine.stages import StageContext
 from ..geometry.sparse_model import SparseModel
 from ..run.extension import ParentRun
 from ..sfm.adjust import focals_of_halves
-from ..sfm.candidates import GIVEN, GIVEN_ALONE
-from ..sfm.drift import MAX_DRIFT
+from ..sfm.candidates import GIVEN, GIVEN_ONLY
+from ..sfm.consistency import MAX_DRIFT
 from ..sfm.driver import Structure
-from ..sfm.given import Agreement, agreement
+from ..sfm.given import GivenFit, fit_given_poses
 from ..sfm.lens import Lens
 from ..source.given import numbering
 from ..system.wording import stretches
@@ -63,7 +63,7 @@ def warn_of_focal(
     `camera` is the prior; `straight` the structure's model with what it would observe without a rolling shutter,
     which was looked for only where the images of the source have times.
     """
-    if structure.mapper == GIVEN_ALONE:
+    if structure.mapper == GIVEN_ONLY:
         return origin
     known, found = camera.mean_focal_length(), structure.model.cameras[1].mean_focal_length()
     halves = focals_of_halves(straight)
@@ -174,7 +174,7 @@ def warn_of_given(
     placed = [i for i in sorted(structure.model.reg_image_ids()) if structure.model.images[i].num_points3D]
     ids = [i - 1 for i in placed if given.known[keyframes[i - 1]]]
     figures: dict[str, Any] = {"given_poses": int(given.known.sum()), "given_metric": given.is_metric}
-    if structure.mapper == GIVEN_ALONE:
+    if structure.mapper == GIVEN_ONLY:
         context.warn(
             f"structure from motion found nothing in the images: {structure.report.registered} keyframes have the "
             f"poses of --poses ({given.what}), unchecked"
@@ -187,7 +187,7 @@ def warn_of_given(
         )
     rows = [keyframes[k] for k in ids]
     found = np.array([pose_of(structure.model.images[k + 1]) for k in ids]).reshape(-1, 4, 4)
-    agreed = agreement(found, given.cam_from_world[rows])
+    agreed = fit_given_poses(found, given.cam_from_world[rows])
     if agreed is None:
         context.warn("the given poses cannot be compared with those found: too few, or they hardly move")
         return figures
@@ -218,7 +218,7 @@ def _require_same_images(
     structure too, warn of it. `frames` are those of keyframes `ids`, which have poses `found` (N, 4, 4)."""
     inside = [n for n, k in enumerate(ids) if k in structure.report.largest]
     frames, found = [frames[n] for n in inside], found[inside]
-    agreed = agreement(found, given.cam_from_world[[frame.id for frame in frames]])
+    agreed = fit_given_poses(found, given.cam_from_world[[frame.id for frame in frames]])
     if agreed is None or not agreed.is_contradiction:
         return
     complaint = _other_poses(context, agreed, found, frames)
@@ -227,10 +227,10 @@ def _require_same_images(
     context.warn(complaint)
 
 
-def _other_poses(context: StageContext, agreed: Agreement, found: NDArray[np.float64], frames: Sequence[Frame]) -> str:
+def _other_poses(context: StageContext, agreed: GivenFit, found: NDArray[np.float64], frames: Sequence[Frame]) -> str:
     def fits(given: NDArray[np.float64]) -> bool:
         known = np.isfinite(given).all(axis=(1, 2))
-        again = agreement(found[known], given[known]) if 2 * int(known.sum()) > len(given) else None
+        again = fit_given_poses(found[known], given[known]) if 2 * int(known.sum()) > len(given) else None
         return again is not None and not again.is_contradiction and not again.wrong.mean() > _FEW_WRONG
 
     settings = context.config.frames
@@ -254,7 +254,7 @@ def in_world_of(before: ParentRun, model: SparseModel, frames: Sequence[Frame]) 
     """The model moved, turned and scaled to where its keyframes were before; as it is where none tells that."""
     poses = before.poses_of([frames[i] for i in model.frame_ids.tolist()])
     known = np.isfinite(poses).all(axis=(1, 2))
-    agreed = agreement(model.cam_from_world[known], poses[known])
+    agreed = fit_given_poses(model.cam_from_world[known], poses[known])
     return model if agreed is None else model.moved(agreed.move)
 
 

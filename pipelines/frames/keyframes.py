@@ -14,7 +14,7 @@ from ...formats.textfile import read_json, write_json
 from ...formats.video import VideoFrame
 from ..config import FramesConfig
 from ..engine.stages import StageContext
-from ..sfm.flow import corners, follow
+from ..sfm.flow import find_corners, follow
 from ..source.faces import Faces
 from ..source.overlap import Motion
 from ..source.recording import Recording
@@ -85,7 +85,7 @@ class _Tracker:
         """Take `gray`, the frame advanced to last, as the keyframe; return the number of its corners."""
         if left_out is not None:
             left_out = cv2.resize(left_out.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
-        self._origin = self._points = corners(gray, self._origin[:0], _MAX_CORNERS, _APART_PX, left_out)
+        self._origin = self._points = find_corners(gray, self._origin[:0], _MAX_CORNERS, _APART_PX, left_out)
         self._started = len(self._origin)
         return self._started
 
@@ -95,7 +95,7 @@ class _Tracker:
         if previous is None:
             return 0.0, 1.0
         if self._started == 0:  # the keyframe showed nothing: the next one is what shows something
-            sees = len(corners(gray, self._origin[:0], _MAX_CORNERS, _APART_PX, None)) >= _MIN_TRACKS
+            sees = len(find_corners(gray, self._origin[:0], _MAX_CORNERS, _APART_PX, None)) >= _MIN_TRACKS
             return 0.0, 0.0 if sees else 1.0
         if len(self._points):
             moved, found = follow(previous, gray, self._points, self._points, _LEVELS)

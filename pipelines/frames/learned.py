@@ -90,9 +90,9 @@ def picture_features(
     """Features of an (H, W, 3) image, of the kind that the settings ask for."""
     if learned is not None:
         return learned.extract(rgb, settings.max_features, left_out)
-    from ..sfm.features import extract_features  # imports pycolmap
+    from ..sfm.features import sift_features  # imports pycolmap
 
-    return extract_features(to_grey(rgb), settings.max_features, left_out)
+    return sift_features(to_grey(rgb), settings.max_features, left_out)
 
 
 def _required(store: ModelStore) -> Model:

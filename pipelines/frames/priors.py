@@ -8,13 +8,13 @@ import pycolmap
 
 from ...formats.errors import InputError
 from ..engine.stages import StageContext
-from ..sfm.candidates import GIVEN_ALONE
+from ..sfm.candidates import GIVEN_ONLY
 from ..sfm.consistency import unexplained
 from ..sfm.driver import Structure, StructureFromMotion, no_prefetch
-from ..sfm.focal import calibrated
 from ..sfm.lens import FOCAL_GUESS, unknown_camera
 from ..sfm.matching import VerifiedPair, match_pair
-from ..sfm.snapshots import Snapshots, features_name
+from ..sfm.snapshots import features_name
+from ..sfm.two_views import calibrated
 from ..system.parallel import parallel_map
 
 _PAIRS = 60
@@ -45,7 +45,7 @@ def solve(
         if free is None:
             raise
     else:
-        free = _without_prior(context, motion, origin, keyframes) if structure.mapper == GIVEN_ALONE else None
+        free = _without_prior(context, motion, origin, keyframes) if structure.mapper == GIVEN_ONLY else None
         if free is None:
             return _unless_contradicted(context, motion, origin, structure, keyframes)
     focal, placed = motion.camera.mean_focal_length(), f"{free.report.registered} of {free.report.total} keyframes"
@@ -122,8 +122,7 @@ def _without_prior(
     held = origin == "given" and not context.config.frames.intrinsics
     if held or motion.is_extension or not motion.camera.has_prior_focal_length:
         return None
-    snapshots = Snapshots(motion.snapshots.folder / "without_prior")
-    snapshots.folder.mkdir(exist_ok=True)
+    snapshots = motion.snapshots.inside("without_prior")
     free = replace(
         motion,
         camera=_unknown(motion),
@@ -137,4 +136,4 @@ def _without_prior(
         found = free.run(keyframes)
     except InputError:
         return None
-    return None if found.mapper == GIVEN_ALONE else found
+    return None if found.mapper == GIVEN_ONLY else found

@@ -18,14 +18,14 @@ from ...formats.video import VideoFrame
 from ..engine.stages import StageContext
 from ..engine.tasks import in_chunks
 from ..geometry.camera import Rig, rig_of
-from ..masks.static import find_still
+from ..masks.static import find_static
 from ..run.extension import parent_of
 from ..run.files import BACKBONE, CALIBRATION, FEATURES, GIVEN_POSES, MATCHED_PAIRS, SPARSE, VOCABULARY, save_frames
 from ..sfm.driver import Structure
 from ..sfm.flow import Picture
 from ..sfm.lens import Lens, distortion_of, make_lens
-from ..sfm.parallax import require_motion
 from ..sfm.rolling import straight_copy
+from ..sfm.two_views import require_motion
 from ..source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
 from ..source.given import given_poses
 from ..source.recording import FolderRecording, Recording, open_recording
@@ -205,7 +205,7 @@ def _with_people(
         masks.leave_out(frames, keyframes, None, 0, context.progress)
         return None
     matches = sum(len(p.matches) for p in found[0].pairs)
-    masks.leave_out(frames, keyframes, find_still(regions, found[0]), matches, context.progress)
+    masks.leave_out(frames, keyframes, find_static(regions, found[0]), matches, context.progress)
     if masks.any_moves:
         return None
     context.warnings.extend(trial.warnings)

@@ -11,9 +11,9 @@ from ...formats.errors import InputError
 from ...formats.textfile import read_json, write_json
 from ..engine.stages import StageContext
 from ..geometry.camera import Rig
-from ..masks.still import LOOKED_AT, find_still
+from ..masks.still import SAMPLED, find_still
 from ..run.extension import parent_of
-from ..sfm.parallax import HOW_TO_FILM
+from ..sfm.two_views import HOW_TO_FILM
 from ..types import Frame
 from .masks import FrameMasks, grey_of
 
@@ -92,7 +92,7 @@ def _found(context: StageContext, masks: FrameMasks, frames: Sequence[Frame], ri
     shares, veils = [], []
     for direction in range(len(rig)):
         own = [f for f in frames if f.id // rig.stations == direction]
-        rows = np.unique(np.linspace(0, len(own) - 1, min(LOOKED_AT, len(own))).round().astype(int))
+        rows = np.unique(np.linspace(0, len(own) - 1, min(SAMPLED, len(own))).round().astype(int))
         looked_at = context.progress.track(rows.tolist(), "still parts", len(rows))
         still = find_still(grey_of(context, masks, own[i]) for i in looked_at)
         if still is not None and still.left_out.any():

@@ -73,8 +73,7 @@ def structure_from_motion(
 
     snapshots = whole = Snapshots(context.snapshot)
     if masks.any_moves:
-        snapshots = Snapshots(context.snapshot / "without_people")
-        snapshots.folder.mkdir(exist_ok=True)
+        snapshots = whole.inside("without_people")
 
     def extract(frame_id: int) -> Features:
         left_out = masks.left_out(frames[frame_id], *size)

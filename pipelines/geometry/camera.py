@@ -45,6 +45,14 @@ def unproject(xy: NDArray[np.float64], depth: NDArray[np.float64], intrinsics: I
     return np.stack([x * depth, y * depth, depth], axis=-1)
 
 
+def nearest_along(ray1: Array, ray2: Array, centre2: Array, cosine: Array) -> tuple[Array, Array]:
+    """Return how far along unit rays (Q, 3) from the origin and from `centre2` (3,) the two are nearest to each other,
+    for the cosines (Q,) of their angles."""
+    sine2 = np.maximum(1 - cosine**2, 1e-12)
+    along1, along2 = ray1 @ centre2, ray2 @ centre2
+    return (along1 - cosine * along2) / sine2, (cosine * along1 - along2) / sine2
+
+
 def pixel_centers(width: int, height: int) -> NDArray[np.float64]:
     """(H, W, 2) the (x, y) of every pixel's centre."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
@@ -142,7 +150,7 @@ def rig_of(directions: int, frames: int) -> Rig:
     return Rig(frames // len(CUBE), CUBE) if directions == len(CUBE) else ONE_CAMERA
 
 
-def tie_cameras(
+def reduce_to_rig(
     blocks: Array, pairs: NDArray[np.int64], right: Array, frame_ids: NDArray[np.int64], rig: Rig
 ) -> tuple[Array, NDArray[np.int64], Array, NDArray[np.int64], Array]:
     """The upper blocks (B, 6, 6) at pairs (B, 2) and right sides (6 N,) of N cameras as those of their S places.

@@ -33,8 +33,8 @@ class PosedDepth:
         """xy (S, 2), depth (S,) and trust (S,) of the known pixels of a coarse grid, `across` along the longer
         side."""
         stride = max(max(self.intrinsics.width, self.intrinsics.height) // across, 1)
-        picked = (slice(stride // 2, None, stride),) * 2
-        depth, trust = self.depth[picked].astype(np.float64), self.trust[picked].astype(np.float64)
+        sampled = (slice(stride // 2, None, stride),) * 2
+        depth, trust = self.depth[sampled].astype(np.float64), self.trust[sampled].astype(np.float64)
         rows, columns = np.nonzero(depth > 0)
         xy = np.stack([columns, rows], 1).astype(np.float64) * stride + (stride // 2 + 0.5)
         return xy, depth[rows, columns], trust[rows, columns]

@@ -187,7 +187,7 @@ def merge(
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     color = np.stack([sums.pop(1) / weight for _ in range(3)], axis=1)
     voxels = Voxels(gathered.size, gathered.keys, sums[0], position, normal, color)
-    return select(voxels, voxels.weight > least)
+    return select_voxels(voxels, voxels.weight > least)
 
 
 @dataclass
@@ -215,7 +215,7 @@ class _Gathered:
             self.sums[c] = np.asarray(np.bincount(place, weights=values, minlength=len(self.keys)), np.float64)
 
 
-def select(voxels: Voxels, keep: NDArray[np.bool_]) -> Voxels:
+def select_voxels(voxels: Voxels, keep: NDArray[np.bool_]) -> Voxels:
     """The voxels where `keep` (V,) is true."""
     return Voxels(
         voxels.size,

@@ -33,7 +33,7 @@ from ..system.wording import stretches
 from ..tracking.adjust import settle
 from ..tracking.front_end import FrontEnd
 from ..tracking.pictures import Pictures
-from ..tracking.pnp import FramePose, group_by_points, predict_pose, recognise
+from ..tracking.pnp import FramePose, group_by_points, localise_in_groups, predict_pose
 from ..tracking.state import NO_SIGHTINGS, Sightings, TrackState
 from ..types import Array, Features, Trajectory, any_of
 
@@ -226,7 +226,7 @@ class Placer:
             seen = self.front_end.correspond(number, start, near)
             solved = self.front_end.solve(number, seen, start)
         if near and not self.front_end.is_trusted(seen, solved):
-            return recognise(number, group_by_points(near, self.state), self.state, self.pictures, self.seed)
+            return localise_in_groups(number, group_by_points(near, self.state), self.state, self.pictures, self.seed)
         return seen, solved
 
     def _settled(self, number: int, time: float, seen: Sightings, pose: Array) -> Array:

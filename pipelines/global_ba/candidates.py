@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 
 from ..geometry.sparse_model import SparseModel
 from ..proxy.maps import mean_iou
-from ..sfm.retrieval import GlobalDescriptors, far_apart, loop_pairs
+from ..sfm.features import GlobalDescriptors, far_apart, loop_pairs
 from ..types import VOID, Array
 
 GRID = (40, 30)

@@ -31,12 +31,12 @@ from ..run.files import (
 from ..run.folder import RunFolder
 from ..sfm.adjust import FEATURE_SD
 from ..sfm.bundle import reprojection_errors
-from ..sfm.retrieval import GlobalDescriptors, compute_global_descriptors, unit
+from ..sfm.features import GlobalDescriptors, compute_global_descriptors, unit
 from ..system.parallel import LruSequence
 from ..system.values import load_value, save_value
 from ..tracking.adjust import align_depths, without_dependent_depth
 from ..tracking.pictures import Pictures, load_shutter
-from ..tracking.state import TrackState, to_sparse_model
+from ..tracking.state import TrackState, sparse_model_of
 from ..types import VOID, Array, Intrinsics, Trajectory
 from .between import pose_every_frame
 from .candidates import LabelSummary, loop_candidates, summarise_labels
@@ -75,7 +75,7 @@ def run(context: StageContext) -> dict[str, Any]:
         after = poses_of(trajectory, model.frame_ids)
         gaussian_map = context.run.load(MAP, "mapping").to(context.device)
         gaussian_map = move_map(gaussian_map, model.frame_ids, before, after, ratio)
-        model = to_sparse_model(closed.state)
+        model = sparse_model_of(closed.state)
         fields = align_depths(model, closed.report, context.run.load(CALIBRATION).intrinsics, context.run.find_proxy)
     DEPTH_FIELDS.save(context.folder, fields)
     refined = None

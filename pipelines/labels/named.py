@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..geometry.camera import resample_nearest, unproject_depth
 from ..geometry.room_layout import FLOOR, Gravity
-from ..geometry.voxels import Voxels, find, find_near, select, touching, voxel_keys
+from ..geometry.voxels import Voxels, find, find_near, select_voxels, touching, voxel_keys
 from ..providers import DepthEstimate, LabelEstimate, Sequence, resample_linear
 from ..types import Frame
 from .segments import SegmentLabels, cut_parts, cut_patches, label_pixels
@@ -169,7 +169,7 @@ def _settle(
     columns, names = share[:, named], [vocabulary.names[i] for i in named]
     objects = np.full(len(voxels), -1, np.int64)
     if weight[void].sum() >= _MIN_SHARE:
-        objects[void] = cut_parts(select(voxels, void), max(vocabulary.limit - len(named), 1))
+        objects[void] = cut_parts(select_voxels(voxels, void), max(vocabulary.limit - len(named), 1))
     count = int(objects.max(initial=-1)) + 1
     own = np.zeros((len(voxels), count), np.float32)
     inside = np.flatnonzero(objects >= 0)

@@ -22,7 +22,7 @@ from ..geometry.voxels import (
     find_near,
     gather_frame,
     merge,
-    select,
+    select_voxels,
     touching,
     voxel_keys,
 )
@@ -75,7 +75,7 @@ class SegmentLabels(SemanticsProvider):
     def fit(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
         """Gather all frames and cut the scene."""
         voxels, gravity, kind = self.structure(frames, depth_of)
-        self._name(kind, cut_parts(select(voxels, kind == OTHER), self._limit - len(NAMES) - 1))
+        self._name(kind, cut_parts(select_voxels(voxels, kind == OTHER), self._limit - len(NAMES) - 1))
         self._keys = voxels.keys
         self._gravity = [round(float(v), 4) for v in gravity.up] if gravity.is_sure else []
 

@@ -13,7 +13,7 @@ from ..geometry.posed_depth import overlaps
 from ..render.gaussian_map import GaussianMap, decided_channels
 from ..run.extension import ParentRun
 from ..run.files import FRAMES
-from ..sfm.given import agreement
+from ..sfm.given import fit_given_poses
 from ..system.progress import Progress
 from ..types import Trajectory
 from .move_map import move_map, rows_of
@@ -92,7 +92,7 @@ def _kept_map(
     """The map of before with every Gaussian moved as its keyframe was since; known (F, 4, 4): the poses of before."""
     rows = np.flatnonzero(trajectory.is_placed & np.isfinite(known[trajectory.frame_ids]).all(axis=(1, 2)))
     ids, now = trajectory.frame_ids[rows], trajectory.cam_from_world[rows]
-    agreed = agreement(known[ids], now)
+    agreed = fit_given_poses(known[ids], now)
     ratio = np.full(len(ids), 1.0 if agreed is None else agreed.move.scale)
     kept = move_map(before.load_map(device), ids, known[ids], now, ratio)
     return replace(kept, class_logits=_relabelled(kept, views, classes))

@@ -83,15 +83,15 @@ def find_moving(
         load: loads the view of a keyframe by its index.
         camera: intrinsics at the size of the views.
         progress: shows the rounds.
-        first: what `look_once` at all keyframes has found.
+        first: what `find_moving_once` at all keyframes has found.
     """
     found = first
     for _ in range(_ROUNDS - 1 if found else 0):
-        found = {**found, **look_once(sorted(found), poses, load, camera, progress, found, _AGAIN)}
+        found = {**found, **find_moving_once(sorted(found), poses, load, camera, progress, found, _AGAIN)}
     return found
 
 
-def look_once(
+def find_moving_once(
     asked: Sequence[int],
     poses: NDArray[np.float64],
     load: Callable[[int], MovingView],
@@ -129,8 +129,7 @@ def _witnesses(poses: NDArray[np.float64], k: int, depth: float) -> list[int]:
 def _evidence(
     view: MovingView, witnesses: Iterator[tuple[MovingView, NDArray[np.bool_] | None]], camera: Intrinsics, rules: Rules
 ) -> NDArray[np.bool_]:
-    """(h, w) where more witnesses, each with what of it moved (h, w), say that another colour belongs there than this
-    one."""
+    """(h, w) where more witnesses, each with what of it moved, expect another colour than expect this one."""
     weight = np.array([0.6, 1, 1], np.float32)
     own, votes = np.ascontiguousarray(view.lab * weight), np.zeros((2, *view.depth.shape), np.int64)
     lens = camera.numbers
@@ -153,8 +152,7 @@ def _evidence(
 
 @kernel
 def _nearest(depth: NDArray, m: NDArray[np.float64], lens: NDArray[np.float64]) -> NDArray[np.int64]:
-    """(h, w) number of the pixel of another view that shows the nearest surface at each of this one's; -1 for none.
-    m (4, 4): view_from_other."""
+    """(h, w) the pixel of another view whose surface is nearest at each of this one's, -1: none; m: view_from_other."""
     height, width = depth.shape
     source = np.full((height, width), -1, np.int64)
     front = np.full((height, width), np.inf)
@@ -177,8 +175,7 @@ def _nearest(depth: NDArray, m: NDArray[np.float64], lens: NDArray[np.float64]) 
 def _in_sight(
     depth: NDArray[np.float32], other_from_view: NDArray[np.float64], camera: Intrinsics
 ) -> NDArray[np.bool_]:
-    """(h, w) whether the surface that a depth map shows projects into another view of the same camera; unknown depth
-    may be anywhere."""
+    """(h, w) whether a depth map's surface projects into another view; unknown depth may be anywhere."""
     points = unproject_depth(depth, camera) @ other_from_view[:3, :3].T + other_from_view[:3, 3]
     xy, z = project(points.reshape(-1, 3), camera)
     inside = (z > 0) & (xy >= 0).all(1) & (xy < [camera.width, camera.height]).all(1)
@@ -189,8 +186,7 @@ def _in_sight(
 def _judge(
     own: NDArray, expected: NDArray, known: NDArray[np.bool_], may_accuse: NDArray[np.bool_], votes: NDArray[np.int64]
 ) -> None:
-    """Count one witness in `votes` (2, h, w), against and for: by the least difference of the expected colour to those
-    of a pixel and its neighbours."""
+    """Count a witness in `votes` (2, h, w), against and for, by the least colour difference around a pixel."""
     height, width = known.shape
     for y in range(height):
         for x in range(width):

@@ -58,7 +58,7 @@ def regions_of(named: NDArray[np.bool_]) -> NDArray[np.int32]:
     return np.asarray(number * reduced, np.int32)
 
 
-def find_still(regions: Sequence[NDArray[np.int32]], structure: Structure) -> list[Parts]:
+def find_static(regions: Sequence[NDArray[np.int32]], structure: Structure) -> list[Parts]:
     """Tell which regions of every keyframe stand still; in parts where one side of a region stands and another moves.
 
     Args:
@@ -88,9 +88,9 @@ def find_still(regions: Sequence[NDArray[np.int32]], structure: Structure) -> li
     for region, found in zip(regions, seen, strict=True):
         against, agreeing = np.bincount(np.concatenate(found), minlength=2 * region.size).reshape(-1, 2).T
         count = np.stack([agreeing, against + agreeing]).astype(np.float64)
-        parts.append(parts_of(region, count, _STILL * expected))
+        parts.append(divide_regions(region, count, _STILL * expected))
         votes.append(np.array([np.bincount(parts[-1].ravel(), row) for row in count], np.float64))
-    return list(zip(parts, judge(votes, things_of(parts), expected), strict=True))
+    return list(zip(parts, judge_static(votes, things_of(parts), expected), strict=True))
 
 
 def _place_of(shape: tuple[int, ...], xy: NDArray[np.float64], camera: pycolmap.Camera) -> NDArray[np.int64]:
@@ -100,7 +100,7 @@ def _place_of(shape: tuple[int, ...], xy: NDArray[np.float64], camera: pycolmap.
     return np.asarray(row.clip(0, height - 1) * width + column.clip(0, width - 1))
 
 
-def parts_of(regions: NDArray[np.int32], votes: NDArray[np.float64], limit: float) -> NDArray[np.int32]:
+def divide_regions(regions: NDArray[np.int32], votes: NDArray[np.float64], limit: float) -> NDArray[np.int32]:
     """Divide regions (h, w) of which one side stands and another moves, by votes (2, h * w): where somebody walks past
     a statue, one outline surrounds both. What has few matches around it goes with what is nearest."""
     agreeing, matches = (
@@ -164,7 +164,7 @@ def things_of(regions: Sequence[NDArray[np.int32]]) -> list[NDArray[np.int32]]:
     return np.split(thing, starts[1:-1])
 
 
-def judge(
+def judge_static(
     votes: Sequence[NDArray[np.float64]], things: Sequence[NDArray[np.int32]], expected: float
 ) -> list[NDArray[np.int8]]:
     """Tell which regions stand still, numbered as in `Parts`.

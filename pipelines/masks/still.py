@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..source.sharpness import reduce_image
 
-LOOKED_AT = 60
+SAMPLED = 60
 """Frames of a recording, evenly spaced."""
 _SIDE = 480
 _EDGE = 4.0
@@ -101,8 +101,7 @@ def _gradient(picture: _Reduced) -> NDArray[np.float32]:
 
 
 def _moments(pictures: Sequence[_Reduced]) -> list[int]:
-    """Frames between which half of what can change has changed; [] where next to nothing does. What moves before a
-    camera that stands changes less than what a camera that moves does."""
+    """Frames between which half of what can change has changed; [] where next to nothing does."""
     count = len(pictures)
     far = [_changed(_gradient(pictures[i]), _gradient(pictures[(i + count // 2) % count]))
            for i in range(0, count, max(1, count // 12))]  # fmt: skip
@@ -154,8 +153,7 @@ def _corners(gradient: NDArray[np.float32], firm: NDArray[np.bool_]) -> NDArray[
 
 
 def _parts(candidates: NDArray[np.bool_], corners: NDArray[np.bool_], loose: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(h, w) pieces of candidates, joined over small gaps, of whose loose gradients enough are corners; with what they
-    enclose and a margin."""
+    """(h, w) pieces of candidates with enough corners, joined over small gaps, with what they enclose and a margin."""
     _, piece = cv2.connectedComponents(_closed(candidates).astype(np.uint8))
     count, gradients = (np.bincount(piece.ravel(), found.ravel()) for found in (corners, loose))
     kept = (count >= _MIN_CORNERS) & (count > _DENSE * gradients)

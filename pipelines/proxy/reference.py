@@ -22,7 +22,7 @@ from ..providers import MAX_CLASSES, DepthEstimate, DepthProvider, Sequence, res
 from ..run.files import BACKBONE, GIVEN_POSES
 from ..run.folder import RunFolder
 from ..sfm.flow import follow
-from ..sfm.given import agreement
+from ..sfm.given import fit_given_poses
 from ..source.recording import Recording, VideoRecording, open_recording
 from ..types import Frame, Intrinsics
 
@@ -238,7 +238,7 @@ def given_scale(run: RunFolder, scale: DepthScale, is_said: bool) -> ReferenceSc
     if given is None or not (given.is_metric or is_said) or backbone is None:
         return None
     rows = np.flatnonzero(given.known[backbone.frame_ids])
-    agreed = agreement(backbone.cam_from_world[rows], given.cam_from_world[backbone.frame_ids[rows]])
+    agreed = fit_given_poses(backbone.cam_from_world[rows], given.cam_from_world[backbone.frame_ids[rows]])
     if agreed is None:
         return None
     return ReferenceScale(agreed.move.scale / scale.value, agreed.scale_sd, len(rows))

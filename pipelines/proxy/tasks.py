@@ -14,7 +14,7 @@ from ..engine.stages import StageContext
 from ..engine.tasks import Chunk, in_chunks
 from ..geometry.camera import resample_nearest
 from ..geometry.voxels import to_lab
-from ..masks.moving import SIDE, MovingView, look_once
+from ..masks.moving import SIDE, MovingView, find_moving_once
 from ..providers import (
     DepthEstimate,
     DepthProvider,
@@ -153,7 +153,7 @@ def make_depths(task: Chunk, progress: Progress) -> None:
 def look_for_moving(task: Chunk, progress: Progress) -> dict[int, NDArray[np.bool_]]:
     """The first round of `find_moving` over the frames."""
     work, frames = _opened(task, progress)
-    return look_once(task.numbers, *work.moving_views(frames, task.known["scale"]), progress)
+    return find_moving_once(task.numbers, *work.moving_views(frames, task.known["scale"]), progress)
 
 
 def look_for_labels(task: Chunk, progress: Progress) -> None:

@@ -33,7 +33,7 @@ _FINE, _ROUGH = 1e-6, 1e-4
 """An adjustment ends with a step that lowers the cost by less, relatively."""
 
 
-def adjust(model: pycolmap.Reconstruction, refine_camera: bool, narrowly: bool = False) -> float:
+def adjust_model(model: pycolmap.Reconstruction, refine_camera: bool, narrowly: bool = False) -> float:
     """Robust bundle adjustment of poses, points and, if asked, the camera, in place; wild observations removed.
 
     `narrowly`: poses and points once more, under a loss as wide as the median error. Where few points hold the path,
@@ -51,33 +51,31 @@ def adjust(model: pycolmap.Reconstruction, refine_camera: bool, narrowly: bool =
     else:
         focal_sd = 0.0
         for roughly in (True, False):
-            solve(model, images, refine_camera=False, roughly=roughly)
+            bundle_adjust(model, images, refine_camera=False, roughly=roughly)
             filter_outliers(model)
     if narrowly:
-        solve(model, images, refine_camera=False, width=min(median_error(model), CAUCHY_PX))
+        bundle_adjust(model, images, refine_camera=False, width=min(median_error(model), CAUCHY_PX))
         filter_outliers(model)
     return focal_sd
 
 
 def _calibrate(model: pycolmap.Reconstruction, images: Sequence[int]) -> float:
-    """The adjustment with the camera; the standard deviation of its focal length, see `adjust`.
-
-    Coefficients that are not significant are zero: most lenses of phones and all renderings have none, and one that is
-    free takes the focal length along. In rendered rooms that is 0.3 to 2 % instead of 0.1 to 0.3.
-    """
+    """Adjust with the camera; return the standard deviation of its focal length."""
+    # Coefficients that are not significant are zero: most lenses of phones and all renderings have none, and one that
+    # is free takes the focal length along. In rendered rooms that is 0.3 to 2 % instead of 0.1 to 0.3.
     camera = model.cameras[1]
-    solve(model, images, refine_camera=True, roughly=True)
+    bundle_adjust(model, images, refine_camera=True, roughly=True)
     filter_outliers(model)
     set_lens(camera, 2)
-    solve(model, images, refine_camera=True, roughly=True)
+    bundle_adjust(model, images, refine_camera=True, roughly=True)
     filter_outliers(model)
     # Before points are removed: the adjuster keeps pointers into the model.
-    covariance = _lens_covariance(model, solve(model, images, refine_camera=True))
+    covariance = _lens_covariance(model, bundle_adjust(model, images, refine_camera=True))
     focals, count = _by_coefficients(np.array(camera.params)[[0, 3, 4]], covariance)
     if count < 2:
         camera.params = [focals[count], *camera.params[1:3], *[p * (count > 0) for p in camera.params[3:]]]
         set_lens(camera, 1)
-        covariance = _lens_covariance(model, solve(model, images, refine_camera=True, bend_lens=count > 0))
+        covariance = _lens_covariance(model, bundle_adjust(model, images, refine_camera=True, bend_lens=count > 0))
     filter_outliers(model)
     order = abs(focals[count] - focals[1 if count != 1 else 2]) / (1 if count else 2)
     halves = _difference_of_halves(model, images, count > 0)
@@ -85,8 +83,7 @@ def _calibrate(model: pycolmap.Reconstruction, images: Sequence[int]) -> float:
 
 
 def _by_coefficients(fitted: NDArray[np.float64], covariance: NDArray[np.float64]) -> tuple[list[float], int]:
-    """The focal length with no, one and two radial coefficients, to first order from one adjustment of (focal length,
-    k1, k2) and its covariance (3, 3); and how many of the coefficients are significant."""
+    """Focal lengths with no, one and two radial coefficients, to first order; how many coefficients are significant."""
     focals, count = [float(fitted[0])], 2
     for held in ([2], [1, 2]):
         block = covariance[np.ix_(held, held)]
@@ -97,7 +94,7 @@ def _by_coefficients(fitted: NDArray[np.float64], covariance: NDArray[np.float64
     return focals, count
 
 
-def solve(
+def bundle_adjust(
     model: pycolmap.Reconstruction,
     images: Sequence[int],
     refine_camera: bool,
@@ -129,7 +126,7 @@ def solve(
     return adjuster
 
 
-def reprojection_errors(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
+def model_errors(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
     """(O,) pixels, of every observation, image after image; infinite behind the camera."""
     found, errors = ModelArrays.of(model), [np.zeros(0)]
     for image_id, pose, own in zip(found.image_ids.tolist(), found.cam_from_world, found.rows(), strict=True):
@@ -144,7 +141,7 @@ def reprojection_errors(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
 
 def median_error(model: pycolmap.Reconstruction) -> float:
     """Return the median reprojection error of all observations, in pixels; 0 without any."""
-    errors = reprojection_errors(model)
+    errors = model_errors(model)
     return float(np.median(errors)) if len(errors) else 0.0
 
 
@@ -154,15 +151,14 @@ def robust_cost(errors: NDArray[np.float64]) -> float:
 
 
 def filter_outliers(model: pycolmap.Reconstruction) -> None:
-    """Observations that the model contradicts, and points that are seen from one direction only, in place."""
+    """Remove outlier observations and points with too small a triangulation angle, in place."""
     manager = pycolmap.ObservationManager(model)
     manager.filter_observations_with_negative_depth()
     manager.filter_all_points3D(_MAX_REPROJECTION_PX, _MIN_ANGLE_DEG)
 
 
 def _lens_covariance(model: pycolmap.Reconstruction, adjuster: pycolmap.CeresBundleAdjuster) -> NDArray[np.float64]:
-    """Covariance (P, P) of what is refined of the camera, the focal length first, were the errors of all observations
-    independent; where the problem does not determine it, that of a focal length that may be anything."""
+    """Covariance (P, P) of the refined camera, focal length first, for independent errors; huge where undetermined."""
     options = pycolmap.BACovarianceOptions()
     options.params = pycolmap.BACovarianceOptionsParams.ALL
     covariance = pycolmap.estimate_ba_covariance(options, model, adjuster)
@@ -180,8 +176,8 @@ def focals_of_halves(model: pycolmap.Reconstruction) -> list[tuple[float, float]
     found = []
     for half in _halves(sorted(model.reg_image_ids())):
         part = _part(model, half)
-        solve(part, half, refine_camera=True, bend_lens=False, roughly=True)
-        covariance = _lens_covariance(part, solve(part, half, refine_camera=True, bend_lens=False))
+        bundle_adjust(part, half, refine_camera=True, bend_lens=False, roughly=True)
+        covariance = _lens_covariance(part, bundle_adjust(part, half, refine_camera=True, bend_lens=False))
         found.append((float(part.cameras[1].mean_focal_length()), CORRELATED * math.sqrt(covariance[0, 0])))
     return found
 
@@ -204,7 +200,7 @@ def _halves(images: Sequence[int]) -> list[Sequence[int]]:
 
 def _focal_of(model: pycolmap.Reconstruction, images: Sequence[int], bend_lens: bool) -> float:
     part = _part(model, images)
-    solve(part, images, refine_camera=True, bend_lens=bend_lens, roughly=True)
+    bundle_adjust(part, images, refine_camera=True, bend_lens=bend_lens, roughly=True)
     return float(part.cameras[1].focal_length)
 
 

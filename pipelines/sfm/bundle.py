@@ -17,7 +17,7 @@ from scipy.sparse import bsr_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
 from ..geometry import se3
-from ..geometry.camera import ONE_CAMERA, Rig, project, tie_cameras
+from ..geometry.camera import ONE_CAMERA, Rig, project, reduce_to_rig
 from ..types import Array, Intrinsics, require_shape
 from . import bundle_kernels as kernels
 
@@ -97,7 +97,7 @@ def _offsets(points_in_cam: Array, xy: Array, intrinsics: Intrinsics) -> Array:
 
 
 @dataclass(frozen=True)
-class Adjusted:
+class AdjustedBundle:
     """The adjusted bundle, in the order it was given, with the robust costs before and after."""
 
     bundle: Bundle
@@ -112,7 +112,7 @@ def adjust_bundle(
     width: float = 2.0,
     ids: NDArray[np.int64] | None = None,
     rig: Rig = ONE_CAMERA,
-) -> Adjusted:
+) -> AdjustedBundle:
     """Minimise reprojection and depth errors, each under Cauchy's loss of `width` standard deviations.
 
     The free motion of the whole is left to the damping, so poses stay near where they were. `ids` (N,): the cameras'
@@ -140,7 +140,7 @@ def adjust_bundle(
         damping = max(damping / 5, 1e-8)
         if gain < _MIN_GAIN:
             break
-    return Adjusted(replace(bundle, cam_from_world=motions, points=points), initial, cost)
+    return AdjustedBundle(replace(bundle, cam_from_world=motions, points=points), initial, cost)
 
 
 class Problem:
@@ -195,7 +195,7 @@ class Problem:
         blocks, right, inverse = self.reduced(at, normal, damping)
         pairs, turns, place = self.pairs, None, np.arange(n)
         if len(self.rig) > 1:
-            blocks, pairs, right, place, turns = tie_cameras(blocks, pairs, right, self.ids, self.rig)
+            blocks, pairs, right, place, turns = reduce_to_rig(blocks, pairs, right, self.ids, self.rig)
         solved = solve_blocks(blocks, pairs, right)
         if solved is None:
             return None

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..system.jit import kernel
 
 MIN_DEPTH = 1e-6
-"""Relative to nothing: a point behind the camera is treated as an outlier of zero weight."""
+"""Cheirality threshold in world units; observations below it get zero weight."""
 
 
 @kernel(inline="always")
@@ -267,8 +267,7 @@ def number_blocks(
 
 @kernel
 def _list_partners(a, order, place, ends, obs_cam, seen, columns, used):  # type: ignore[no-untyped-def]
-    """Camera a and who shares a point with it, into `columns` from `used` on; the next place in the order of the
-    cameras' observations, and where the columns end."""
+    """List camera a and those that share a point with it in `columns`, from `used` on; return the next places."""
     columns[used], seen[a] = a, a
     used += 1
     while place < len(order) and obs_cam[order[place]] == a:

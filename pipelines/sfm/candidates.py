@@ -21,24 +21,22 @@ from ..geometry.camera import ONE_CAMERA
 from ..system.parallel import LruSequence
 from ..system.progress import Progress
 from ..types import Features
-from .adjust import CAUCHY_PX, LOSS_SD, adjust, filter_outliers, solve
+from .adjust import CAUCHY_PX, LOSS_SD, adjust_model, bundle_adjust, filter_outliers
 from .consistency import (
     MIN_BETTER,
-    MIN_GAIN_OF_FREEING,
+    MIN_SELF_CALIBRATION_GAIN,
     ModelReport,
-    gain_of_freeing,
     judge,
+    self_calibration_gain,
     unexplained,
-    without_misplaced,
 )
-from .focal import calibrated
 from .given import posed_model
+from .joining import WIDE, merge_loop_points, repair_scale_breaks
 from .lens import FOCAL_GUESS, unknown_camera
 from .matching import VerifiedPair, write_database
 from .rolling import NO_READOUT, Readout, adjust_rolling, read_readout, straight_copy
-from .scale_repair import repair_scale_breaks
 from .snapshots import Snapshots
-from .windows import WIDE, close_loops
+from .two_views import calibrated
 
 _ANY_DISTORTION = 1e9
 """COLMAP takes a camera with a coefficient above 1 for one that ran away, and places no view of it. One that is held
@@ -46,7 +44,7 @@ cannot run away, and real ones have such: the third radial one of a Kinect is 1.
 
 _MIN_KEYFRAMES = 3
 _MIN_POINTS = 30
-NEIGHBOURS, GIVEN, GIVEN_ALONE = "neighbours", "given", "given-alone"
+NEIGHBOURS, GIVEN, GIVEN_ONLY = "neighbours", "given", "given-alone"
 _AS_GOOD = 0.98
 """Share of a model's score from which another is as good: one of a camera found anew, one of given poses."""
 _UNSURE = 0.03
@@ -61,7 +59,7 @@ _ScoredModel = tuple[pycolmap.Reconstruction, str, ModelReport]
 
 
 def _selection_score(tried: _ScoredModel) -> float:
-    """To choose by: the score, of a model that starts from given poses so much more that it need only be as good."""
+    """Ranking score; models from given poses win ties."""
     return tried[2].score / (_AS_GOOD if tried[1].startswith(GIVEN) else 1.0)
 
 
@@ -86,7 +84,7 @@ class KeyframeSet:
 
 
 @dataclass(frozen=True)
-class Adjusted:
+class AdjustedModel:
     model: pycolmap.Reconstruction
     mapper: str
     focal_sd: float
@@ -95,10 +93,9 @@ class Adjusted:
 
 
 def _better(
-    first: Adjusted | None, second: Adjusted | None, views: KeyframeSet, pairs: Sequence[VerifiedPair]
-) -> Adjusted | None:
-    """The first of two models of one recording, unless only the second is one or explains its matches clearly better
-    and as many of the views."""
+    first: AdjustedModel | None, second: AdjustedModel | None, views: KeyframeSet, pairs: Sequence[VerifiedPair]
+) -> AdjustedModel | None:
+    """Return the first of two models unless only the second exists or explains clearly more and as many views."""
     if first is None or second is None:
         return first or second
     left = unexplained(second.model, pairs, views.xy) < (1 - MIN_BETTER) * unexplained(first.model, pairs, views.xy)
@@ -106,7 +103,7 @@ def _better(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Candidates:
+class CandidateModels:
     """Inputs of candidate models besides the keyframes: `camera` is the prior, `is_fixed` holds it, `is_stated` holds
     it unless the images contradict it; `asks_pairs`: the focal length that pairs tell, not COLMAP's guess, is where
     calibration starts. `is_extension`: the given poses are those of a finished run that images were
@@ -126,44 +123,38 @@ class Candidates:
     frame_interval: float = 0.0
     cam_from_rig: NDArray[np.float64] = field(default_factory=lambda: ONE_CAMERA.cam_from_rig)
 
-    def _calibrated(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
-        """The best model; of a stated camera the model of one that is found anew, where that explains the images
-        much better, or where the stated one gives none."""
+    def _calibrated(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> AdjustedModel | None:
+        """Return the best model, self-calibrated where that explains much more than the stated camera does."""
         held = self._best(views, pairs)
         if not self.is_stated:
             return held
         if held is not None:
             straight = straight_copy(held.model, views.xy, views.times, held.readout)
-            if gain_of_freeing(straight) < MIN_GAIN_OF_FREEING:
+            if self_calibration_gain(straight) < MIN_SELF_CALIBRATION_GAIN:
                 return held
-        free = next(filter(None, (self._freed(name, views, pairs) for name in ("stated", "unknown"))), None)
+        free = next(filter(None, (self._self_calibrate(name, views, pairs) for name in ("stated", "unknown"))), None)
         return _better(held, free, views, pairs)
 
-    def _freed(self, start: str, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
+    def _self_calibrate(self, start: str, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> AdjustedModel | None:
         """The model of a camera that is found anew, from the stated focal length or from nothing."""
         is_prior, (width, height) = start == "stated", (self.camera.width, self.camera.height)
         focal = self.camera.mean_focal_length() if is_prior else FOCAL_GUESS * max(width, height)
-        snapshots = Snapshots(self.snapshots.folder / f"freed_from_{start}")
-        snapshots.folder.mkdir(exist_ok=True)
+        snapshots = self.snapshots.inside(f"freed_from_{start}")
         camera = unknown_camera(width, height, focal, is_prior)
         return replace(self, camera=camera, is_fixed=False, is_stated=False, snapshots=snapshots)._best(views, pairs)
 
-    def _best(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
-        """The best model, its camera calibrated unless it is fixed; where that leaves the focal length unsure, of two
-        that start from different ones."""
+    def _best(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> AdjustedModel | None:
+        """Return the best adjusted model, of two starting focal lengths where one leaves it unsure."""
         found = self._adjusted(views, pairs)
         if found is None or found.focal_sd < _UNSURE * found.model.cameras[1].mean_focal_length():
             return found
         if self.camera.has_prior_focal_length:
             return found
-        snapshots = Snapshots(self.snapshots.folder / "from_guess")
-        snapshots.folder.mkdir(exist_ok=True)
-        other = replace(self, asks_pairs=False, snapshots=snapshots)._adjusted(views, pairs)
+        other = replace(self, asks_pairs=False, snapshots=self.snapshots.inside("from_guess"))._adjusted(views, pairs)
         return _better(found, other, views, pairs)
 
-    def _adjusted(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
-        """The best model, its camera calibrated unless it is fixed; with the readout of a rolling shutter, where one is
-        given or the model shows it."""
+    def _adjusted(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> AdjustedModel | None:
+        """Return the best adjusted model, with the readout of a rolling shutter that is given or found."""
         mappers = ("global", "incremental")
         found = self._map(views, pairs, (GIVEN, *mappers) if self.is_extension else (*mappers, GIVEN))
         if found is None:
@@ -173,20 +164,19 @@ class Candidates:
             model, views.xy, views.times, self._readout(), not self.is_fixed, bool(views.weak), self.frame_interval
         )
         if rolling is not None:
-            return Adjusted(rolling[0], mapper, rolling[2], report.score, rolling[1])
-        return Adjusted(model, mapper, adjust(model, not self.is_fixed, bool(views.weak)), report.score, NO_READOUT)
+            return AdjustedModel(rolling[0], mapper, rolling[2], report.score, rolling[1])
+        focal_sd = adjust_model(model, not self.is_fixed, bool(views.weak))
+        return AdjustedModel(model, mapper, focal_sd, report.score, NO_READOUT)
 
     def _readout(self) -> Readout | None:
-        """The readout to adjust with, None for one to be found: of panoramas and of images without times there is none
-        to find."""
+        """Return the readout to adjust with, None for one to be found: not of panoramas, nor without times."""
         given = read_readout(self.config.rolling_shutter)
         return NO_READOUT if len(self.cam_from_rig) > 1 or (given is None and not self.frame_interval) else given
 
     def _map(
         self, views: KeyframeSet, pairs: Sequence[VerifiedPair], mappers: Sequence[str] = ("global", "incremental")
     ) -> _ScoredModel | None:
-        """The best of the mappers' models, None where none is any; the next is only made when those before it are
-        doubtful."""
+        """Return the best of the mappers' models; the next is only made when those before it are doubtful."""
         best: _ScoredModel | None = None
         possible = {GIVEN} if views.given is not None else set()
         possible |= {name for name in mappers if name != GIVEN and self.config.mapper in ("auto", name)}
@@ -205,8 +195,7 @@ class Candidates:
         return best
 
     def _remap_from_neighbours(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> _ScoredModel | None:
-        """The model of a path that things which repeat have folded: made of what neighbours share, for little repeats
-        within so few images, its loops closed by the other pairs that nearly agree with that."""
+        """Map from neighbours alone, among which little repeats, then close loops by pairs that nearly agree."""
         total, reach = self._places(views.xy), self.config.overlap
         near = [p for p in pairs if abs(p.first % total - p.second % total) <= reach]
         straight = self._build_model(NEIGHBOURS, views, near, pairs)
@@ -217,15 +206,14 @@ class Candidates:
         return closed if grown is closed else self._close_loops(grown, views, pairs)
 
     def _close_loops(self, found: _ScoredModel, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> _ScoredModel:
-        """The model with those points made one that are one by matched pairs which nearly agree, and all adjusted
-        by a wide loss and a narrow one, again and again as long as that makes it better."""
+        """Merge points by matched pairs that nearly agree and adjust, as long as the score grows."""
         while True:
             model = pycolmap.Reconstruction(found[0])
-            if not close_loops(model, pairs, (), views.xy):
+            if not merge_loop_points(model, pairs, (), views.xy):
                 return found
             images = sorted(model.reg_image_ids())
             for width in (WIDE * LOSS_SD, CAUCHY_PX):
-                solve(model, images, refine_camera=False, width=width, roughly=True)
+                bundle_adjust(model, images, refine_camera=False, width=width, roughly=True)
             filter_outliers(model)
             closed = self._judged(f"{NEIGHBOURS}-closed", model, views, pairs)
             if closed[2].score <= found[2].score:
@@ -235,8 +223,7 @@ class Candidates:
     def _register_remaining(
         self, found: _ScoredModel, views: KeyframeSet, every: Sequence[VerifiedPair], known: Sequence[VerifiedPair]
     ) -> _ScoredModel:
-        """The model with the keyframes that it leaves added one by one, each by all that it shares with those placed,
-        where that makes it better; `known` are the pairs that it was made from."""
+        """Register remaining keyframes incrementally where that raises the score; it was made from pairs `known`."""
         left = set(range(len(views.xy))) - {i - 1 for i in found[0].reg_image_ids()}
         more = [p for p in every if p.first in left or p.second in left]
         if not more:
@@ -260,9 +247,8 @@ class Candidates:
     def _judged(
         self, name: str, model: pycolmap.Reconstruction, views: KeyframeSet, every: Sequence[VerifiedPair]
     ) -> _ScoredModel:
-        """The model without what its neighbours contradict, repaired, and how good it is."""
+        """The model, repaired, and how good it is."""
         seen = every, views.xy, self._places(views.xy), self.config.overlap
-        model = without_misplaced(model, *seen)
         report = judge(model, *seen)
         if views.weak:
             model, report = repair_scale_breaks(model, report, *seen, self.seed)

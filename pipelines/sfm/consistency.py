@@ -1,5 +1,11 @@
-"""Agreement of a model with the matches it was made from."""
+"""Agreement of a model with the matches it was made from, and the scale along its path.
 
+Two views agree by their epipolar lines whatever the length between them, so no pair of views contradicts a path whose
+unit grows along the way. Three do: what a keyframe shows has one depth by the views before it and another by those
+after it.
+"""
+
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -8,28 +14,50 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from .adjust import median_error, reprojection_errors, robust_cost, solve
-from .drift import MAX_DRIFT, NO_DRIFT, ScaleDrift, scale_drift
-from .lens import distortion_of
-from .matching import VerifiedPair
-from .seams import (
+from ..geometry.camera import nearest_along
+from .adjust import bundle_adjust, median_error, model_errors, robust_cost
+from .components import (
     PairCheck,
     Seam,
-    find_misplaced,
-    find_parts,
+    find_components,
     find_seams,
-    remove_keyframes,
     tracks_of,
     worst_contradictions,
 )
+from .lens import distortion_of
+from .matching import VerifiedPair
 
-MIN_GAIN_OF_FREEING = 0.03
+Array = NDArray[np.float64]
+
+_MIN_ANGLE = np.radians(1.0)
+"""Rays that are nearer to parallel give no depth."""
+_MIN_FEATURES = 12
+_MAX_ERROR = 2.0
+"""Pixels from the epipolar line."""
+_SURE = 3.0
+"""Standard deviations that are taken off the drift."""
+MAX_DRIFT = 1.25
+"""A path is consistent up to this."""
+
+
+@dataclass(frozen=True)
+class ScaleDrift:
+    """By what factor the unit of a path differs at least between two keyframes, `first` and `last`; 1 for a path of one
+    scale."""
+
+    factor: float = 1.0
+    first: int = 0
+    last: int = 0
+
+
+NO_DRIFT = ScaleDrift()
+
+MIN_SELF_CALIBRATION_GAIN = 0.03
 """Of the cost that must go. Freed, a Kinect's calibration explained 0.013 more of a recording with rolling shutter and
 blur, another Kinect's nominal 525 px 0.057."""
 MIN_BETTER = 0.01
 """By how much less of the matches the model of the camera found anew must leave unexplained to be taken."""
 _AGREE_PX = 4.0
-_MAX_MISPLACED = 0.2
 
 
 @dataclass(frozen=True)
@@ -39,8 +67,7 @@ class ModelReport:
     `agreement`: share of the verified matches between registered keyframes that are within 4 px of the epipolar line
     of the final poses; `pairs_agreeing`: share of the pairs of which more than half of the matches do. A folded
     trajectory leaves whole pairs that disagree, however small its reprojection error is. `seams` and `parts`: see
-    `find_seams` and `find_parts`; they see one bad place among many good ones. `drift`: see `scale_drift`; no pair of
-    views contradicts a path whose scale changes along it.
+    `find_seams` and `find_components`; they see one bad place among many good ones. `drift`: see `scale_drift`.
     """
 
     registered: int
@@ -102,26 +129,12 @@ def judge(
     matches, agreeing = sum(c.matches for c in checks), sum(c.agreeing for c in checks)
     placed, tracks = sorted({(i - 1) % total for i in model.reg_image_ids()}), tracks_of(model, total)
     seams = find_seams(placed, checks, tracks, reach)
-    parts = find_parts(placed, seams, tracks, reach)
+    parts = find_components(placed, seams, tracks, reach)
     return ModelReport(
         len(placed), total, model.num_points3D(), median_error(model),
         agreeing / max(matches, 1), sum(c.agrees for c in checks) / max(len(checks), 1),
         tuple(seams), tuple(map(tuple, parts)), scale_drift(model, pairs, xy, total, reach),
     )  # fmt: skip
-
-
-def without_misplaced(
-    model: pycolmap.Reconstruction,
-    pairs: Sequence[VerifiedPair],
-    xy: Sequence[NDArray[np.float64]],
-    total: int,
-    reach: int,
-) -> pycolmap.Reconstruction:
-    """The model, keyframes that their neighbours contradict taken out of it in place; arguments as of `judge`."""
-    misplaced = find_misplaced(check_pairs(model, pairs, xy, total), reach)
-    if 0 < len(misplaced) <= _MAX_MISPLACED * model.num_reg_frames():  # of more, who knows which are right
-        remove_keyframes(model, misplaced)
-    return model
 
 
 def check_pairs(
@@ -178,7 +191,7 @@ def epipolar_error(
     return np.abs(residual) / np.sqrt(np.maximum(scale, 1e-300))
 
 
-def gain_of_freeing(model: pycolmap.Reconstruction) -> float:
+def self_calibration_gain(model: pycolmap.Reconstruction) -> float:
     """The share of the robust reprojection cost that goes when a held camera is adjusted with poses and points: its
     focal lengths, and two radial coefficients where it states no distortion. The model stays as it is; its observations
     are where frames taken at once would have them, for a free lens bends itself to a rolling shutter."""
@@ -189,9 +202,9 @@ def gain_of_freeing(model: pycolmap.Reconstruction) -> float:
         middle = camera.principal_point_x, camera.principal_point_y
         params = [camera.mean_focal_length(), *middle, 0.0, 0.0]
         camera.model, camera.params = pycolmap.CameraModelId.RADIAL, params
-    before = robust_cost(reprojection_errors(model))
-    solve(freed, sorted(freed.reg_image_ids()), refine_camera=True, bend_lens=bends)
-    return 1 - robust_cost(reprojection_errors(freed)) / max(before, 1e-12)
+    before = robust_cost(model_errors(model))
+    bundle_adjust(freed, sorted(freed.reg_image_ids()), refine_camera=True, bend_lens=bends)
+    return 1 - robust_cost(model_errors(freed)) / max(before, 1e-12)
 
 
 def unexplained(
@@ -201,3 +214,90 @@ def unexplained(
     poses and camera, whichever of them its points are made of."""
     errors = [error for _, error in matched_errors(model, pairs, xy)]
     return robust_cost(np.concatenate(errors)) if errors else float("inf")
+
+
+# scale along the path --------------------------------------------------------------------------------------------
+
+
+def scale_drift(
+    model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], xy: Sequence[Array], total: int, reach: int
+) -> ScaleDrift:
+    """Measure how the scale of a path changes, by matches of keyframes at most `reach` apart; other arguments as of
+    `consistency.judge`. Of panoramas the first direction is measured."""
+    camera, focal = model.cameras[1], model.cameras[1].mean_focal_length()
+    placed = [i - 1 for i in sorted(model.reg_image_ids()) if i <= total]
+    poses = {k: model.images[k + 1].cam_from_world().matrix() for k in placed}
+    rays = {k: unit_rays(camera, xy[k]) for k in placed}
+    sides: dict[int, tuple[_Side, _Side]] = defaultdict(lambda: (_Side(), _Side()))
+    for pair in pairs:
+        i, j = sorted((pair.first, pair.second))
+        if i not in poses or j not in poses or not 0 < j - i <= reach:
+            continue
+        matches = pair.matches if pair.first == i else pair.matches[:, ::-1]
+        seen = rays[i][matches[:, 0]], rays[j][matches[:, 1]]
+        depth_i, depth_j, angle, off = _depths(poses[i], poses[j], *seen)
+        good = (angle > _MIN_ANGLE) & (off * focal < _MAX_ERROR) & (depth_i > 0) & (depth_j > 0)
+        sides[i][1].add(matches[good, 0], depth_i[good], angle[good], j - i)
+        sides[j][0].add(matches[good, 1], depth_j[good], angle[good], j - i)
+    steps, variances = np.zeros(total), np.zeros(total)
+    for k, (before, after) in sides.items():
+        steps[k], variances[k] = _growth(before, after, len(xy[k]))
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    doubt = np.concatenate([[0.0], np.cumsum(variances)])
+    apart = np.abs(along[:, None] - along[None]) - _SURE * np.sqrt(np.abs(doubt[:, None] - doubt[None]) * 2 * reach)
+    first, last = sorted(np.unravel_index(int(np.argmax(apart)), apart.shape))
+    if not apart[first, last] > 0:
+        return NO_DRIFT
+    return ScaleDrift(float(np.exp(apart[first, last])), int(first), int(last) - 1)
+
+
+class _Side:
+    """Depths of a keyframe's features by views on one side of it."""
+
+    def __init__(self) -> None:
+        self.features: list[NDArray[np.int64]] = []
+        self.rows: list[Array] = []
+
+    def add(self, features: NDArray[np.uint32], depth: Array, angle: Array, apart: int) -> None:
+        self.features.append(features.astype(np.int64))
+        self.rows.append(np.column_stack([angle**2, np.log(depth) * angle**2, np.full(len(depth), apart) * angle**2]))
+
+    def mean(self, count: int) -> Array:
+        """(count, 3) of every feature the sum of the weights, and weighted means of log depth and of the distance."""
+        sums = np.zeros((count, 3))
+        for features, rows in zip(self.features, self.rows, strict=True):
+            np.add.at(sums, features, rows)
+        sums[:, 1:] /= np.maximum(sums[:, :1], 1e-12)
+        return sums
+
+
+def _growth(before: _Side, after: _Side, count: int) -> tuple[float, float]:
+    """By how much the logarithm of the unit grows from a keyframe to the next, and its variance."""
+    a, b = before.mean(count), after.mean(count)
+    both = (a[:, 0] > 0) & (b[:, 0] > 0)
+    if both.sum() < _MIN_FEATURES:
+        return 0.0, 0.0
+    # A depth by a view twice as far along the path is off by half of what has grown on the way.
+    span = (a[both, 2] + b[both, 2]) / 2
+    growth = (b[both, 1] - a[both, 1]) / span
+    middle = float(np.median(growth))
+    spread = 1.4826 * float(np.median(np.abs(growth - middle)))
+    return middle, 1.57 * spread**2 / both.sum()
+
+
+def unit_rays(camera: pycolmap.Camera, xy: Array) -> Array:
+    """Return the rays (F, 3) of pixels (F, 2), unit vectors in the camera."""
+    rays = np.column_stack([np.asarray(camera.cam_from_img(xy)), np.ones(len(xy))])
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def _depths(first: Array, second: Array, a: Array, b: Array) -> tuple[Array, Array, Array, Array]:
+    """Depths (M,) along unit rays a and b (M, 3) where they are nearest, their angle, and the angle of the gap."""
+    rotation = second[:, :3] @ first[:, :3].T
+    move = second[:, 3] - rotation @ first[:, 3]  # where the first centre lies in the second camera
+    turned = a @ rotation.T
+    cosine = (turned * b).sum(1)
+    depth_a, depth_b = nearest_along(turned, b, -move, cosine)
+    angle = np.arcsin(np.minimum(np.sqrt(np.maximum(1 - cosine**2, 1e-12)), 1.0))
+    gap = np.linalg.norm(move + depth_a[:, None] * turned - depth_b[:, None] * b, axis=1)
+    return depth_a, depth_b, angle, gap / np.maximum(np.minimum(depth_a, depth_b), 1e-9)

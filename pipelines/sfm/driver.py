@@ -17,17 +17,11 @@ from ..system.memory import WINDOW, release_free_memory, windows_of
 from ..system.parallel import LruSequence, parallel_map
 from ..system.progress import log
 from ..types import Features, Vocabulary
-from .adjust import adjust
-from .candidates import GIVEN_ALONE, Adjusted, Candidates, KeyframeSet
-from .consistency import ModelReport, judge
-from .drift import scale_drift
-from .flow import Picture, weakly_connected, with_bridges
-from .given import bare_model, set_best_focal
-from .lens import set_lens
-from .matching import VerifiedPair, match_pair
-from .parallax import require_parallax, why_no_structure
-from .pose_groups import loose_cameras
-from .retrieval import (
+from .adjust import adjust_model
+from .candidates import GIVEN_ONLY, AdjustedModel, CandidateModels, KeyframeSet
+from .components import cut, remove_keyframes, undetermined_cameras
+from .consistency import ModelReport, judge, scale_drift
+from .features import (
     GlobalDescriptors,
     compute_global_descriptors,
     far_apart,
@@ -35,10 +29,14 @@ from .retrieval import (
     loop_pairs,
     sequential_pairs,
 )
+from .flow import Picture, weakly_connected, with_bridges
+from .given import bare_model, set_best_focal
+from .joining import WindowModels, adjust_joined
+from .lens import set_lens
+from .matching import VerifiedPair, match_pair
 from .rolling import NO_READOUT, Readout, RollingModel, adjust_rolling, read_readout, rectified_features
-from .seams import cut, remove_keyframes
-from .snapshots import Snapshots, features_name, pairs_name
-from .windows import WindowModels, adjust_joined
+from .snapshots import features_name, pairs_name
+from .two_views import require_parallax, why_no_structure
 
 _PAIRS_PER_BLOCK = 64
 _FEATURES_SHARE = 0.25
@@ -57,7 +55,7 @@ class Structure:
     No point is seen from two of the report's parts: the transform between them is unknown. `tried` are the pairs
     of keyframes that were matched, `pairs` those of them that obey one geometry. `pieces` are further models, in the
     same camera, of keyframes that the ones before could not place, each with a world and a unit of its own.
-    `loose` were left out again: see `loose_cameras`.
+    `loose` were left out again: see `undetermined_cameras`.
     """
 
     model: pycolmap.Reconstruction
@@ -74,7 +72,7 @@ class Structure:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StructureFromMotion(Candidates):
+class StructureFromMotion(CandidateModels):
     """`extract(frame_id)` gives a frame's features, `picture` what they are of, `match` the pairs of two frames' that
     are alike. time(frame_id): seconds at which a frame was taken; `given` (F, 4, 4): poses of all frames by another
     program, NaN where none. divide("features" | "pairs" | "windows", count, known) has so many of those left in the
@@ -137,17 +135,17 @@ class StructureFromMotion(Candidates):
             remove_keyframes(model, loose)
 
     def _loose(self, model: pycolmap.Reconstruction, views: KeyframeSet, report: ModelReport) -> list[int]:
-        """Keyframes whose poses the images do not determine: see `loose_cameras`. Panoramas see all around: none."""
+        """Keyframes whose poses the images do not determine: none of panoramas, which see all around."""
         if len(self.cam_from_rig) > 1 or not model.num_points3D():
             return []
         rolling = RollingModel(model, views.xy, views.times)
         bundle, _, pinhole = rolling.bundle()
         number = {i - 1: n for n, i in enumerate(rolling.images)}
         parts = [[number[k] for k in part] for part in report.parts]
-        loose, _ = loose_cameras(bundle, pinhole, parts, self.config.least_piece, range(len(number)))
+        loose, _ = undetermined_cameras(bundle, pinhole, parts, self.config.least_piece, range(len(number)))
         return [rolling.images[n] - 1 for n in loose]
 
-    def _as_given(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
+    def _as_given(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> AdjustedModel | None:
         """The given poses as they are, without a point."""
         if views.given is None:
             return None
@@ -157,7 +155,7 @@ class StructureFromMotion(Candidates):
         if not self.camera.has_prior_focal_length and pairs:
             set_best_focal(model, pairs, views.xy)
         focal_sd = 0.0 if self.is_fixed else model.cameras[1].mean_focal_length()
-        return Adjusted(model, GIVEN_ALONE, focal_sd, 0.0, NO_READOUT)
+        return AdjustedModel(model, GIVEN_ONLY, focal_sd, 0.0, NO_READOUT)
 
     def _windows(self, count: int) -> list[range]:
         """Which keyframes are mapped at once: of panoramas all."""
@@ -165,9 +163,8 @@ class StructureFromMotion(Candidates):
 
     def _in_windows(
         self, windows: Sequence[range], views: KeyframeSet, pairs: Sequence[VerifiedPair]
-    ) -> tuple[Adjusted | None, list[pycolmap.Reconstruction]]:
-        """The models of the windows of a long recording, joined, in the camera that all of them determine; and the
-        parts that are not connected to the largest."""
+    ) -> tuple[AdjustedModel | None, list[pycolmap.Reconstruction]]:
+        """Map a long recording window by window; return the joined model and the components apart from it."""
         views.features.forget()
         made, surest = WindowModels(), None
         for window in self.progress.track(windows, "windows", len(windows)):
@@ -192,17 +189,16 @@ class StructureFromMotion(Candidates):
             together(other, views.xy, views.times, readout)
         return replace(whole, readout=readout), others
 
-    def _window(self, window: range, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> Adjusted | None:
+    def _window(self, window: range, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> AdjustedModel | None:
         """The model of one of several, made unless it is stored."""
-        snapshots = Snapshots(self.snapshots.folder / f"window_{window.start:06d}_{window.stop:06d}")
-        snapshots.folder.mkdir(exist_ok=True)
+        snapshots = self.snapshots.inside(f"window_{window.start:06d}_{window.stop:06d}")
         figures = snapshots.folder / "adjusted.json"
 
         def solve(_: Path) -> pycolmap.Reconstruction | None:
             inside = [replace(p, first=p.first - window.start, second=p.second - window.start)
                       for p in pairs if p.first in window and p.second in window]  # fmt: skip
-            alone = replace(self, is_stated=False, snapshots=snapshots)
-            if (found := alone._calibrated(views.part(window), inside)) is None:
+            of_window = replace(self, is_stated=False, snapshots=snapshots)
+            if (found := of_window._calibrated(views.part(window), inside)) is None:
                 return None
             write_json(figures, [found.mapper, found.focal_sd, found.score, found.readout])
             return found.model
@@ -210,7 +206,7 @@ class StructureFromMotion(Candidates):
         if (model := snapshots.model("adjusted", solve)) is None:
             return None
         mapper, focal_sd, score, readout = read_json(figures, None)
-        return Adjusted(model, mapper, focal_sd, score, tuple(readout))
+        return AdjustedModel(model, mapper, focal_sd, score, tuple(readout))
 
     def map_windows(
         self, numbers: Iterable[int], keyframe_ids: Sequence[int], proposed: Sequence[tuple[int, int]]
@@ -228,8 +224,7 @@ class StructureFromMotion(Candidates):
         model: pycolmap.Reconstruction,
         apart: Sequence[pycolmap.Reconstruction],
     ) -> list[pycolmap.Reconstruction]:
-        """Sound models of the keyframes that `model` leaves, those `apart` that are there already and others in its
-        camera, until there is none of the least size; of a long recording no more at once than a window may have."""
+        """Map the keyframes that `model` leaves, besides those `apart`, in its camera, a window's worth at once."""
         camera, pieces = model.cameras[1], [*apart]
         camera.has_prior_focal_length = True
         placed = {i - 1 for m in (model, *apart) for i in m.reg_image_ids()}
@@ -252,17 +247,16 @@ class StructureFromMotion(Candidates):
             rest = [p for p in pairs if p.first in left and p.second in left]
             if len({k for p in rest for k in (p.first, p.second)}) < self.config.least_piece:
                 return pieces
-            snapshots = Snapshots(self.snapshots.folder / f"piece_{number}")
-            snapshots.folder.mkdir(exist_ok=True)
-            alone = replace(self, camera=camera, is_fixed=True, snapshots=snapshots)
-            tried = [alone._map(views, rest, ("global",))]
+            snapshots = self.snapshots.inside(f"piece_{number}")
+            of_piece = replace(self, camera=camera, is_fixed=True, snapshots=snapshots)
+            tried = [of_piece._map(views, rest, ("global",))]
             if tried[0] is None or not self._is_piece(tried[0][2]):
-                tried.append(alone._map(views, rest, ("incremental",)))
+                tried.append(of_piece._map(views, rest, ("incremental",)))
             found = max(filter(None, tried), key=lambda f: (self._is_piece(f[2]), f[2].registered), default=None)
             if found is None or found[2].registered < self.config.least_piece:
                 return pieces
             piece = found[0]
-            adjust(piece, refine_camera=False)
+            adjust_model(piece, refine_camera=False)
             report = judge(piece, rest, views.xy, self._places(views.xy), self.config.overlap)
             left -= {i - 1 for i in piece.reg_image_ids()}
             if self._is_piece(report):
@@ -274,10 +268,9 @@ class StructureFromMotion(Candidates):
         return len(report.largest) >= self.config.least_piece and report.is_consistent
 
     def _largest_first(
-        self, found: Adjusted, pieces: list[pycolmap.Reconstruction], views: KeyframeSet
-    ) -> tuple[Adjusted, list[pycolmap.Reconstruction]]:
-        """The largest model, which calibrates the camera of all where it is surer of it, and the others; all with the
-        readout of the first."""
+        self, found: AdjustedModel, pieces: list[pycolmap.Reconstruction], views: KeyframeSet
+    ) -> tuple[AdjustedModel, list[pycolmap.Reconstruction]]:
+        """Return the largest model, which calibrates all where it is surer, and the others; with one readout."""
         models = [found.model, *pieces]
         largest = max(models, key=lambda m: m.num_reg_images())
         done = largest if largest is found.model else None
@@ -285,11 +278,11 @@ class StructureFromMotion(Candidates):
         if done is None and not self.is_fixed:
             again = pycolmap.Reconstruction(largest)
             set_lens(again.cameras[1], 1)
-            if (focal_sd := adjust(again, refine_camera=True)) < found.focal_sd:
+            if (focal_sd := adjust_model(again, refine_camera=True)) < found.focal_sd:
                 largest, found = again, replace(found, focal_sd=focal_sd)
                 for other in others:
                     other.cameras[1].params = again.cameras[1].params.tolist()
-                    adjust(other, refine_camera=False)
+                    adjust_model(other, refine_camera=False)
 
         def rolled(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
             if model is done:
@@ -314,9 +307,9 @@ class StructureFromMotion(Candidates):
         return features
 
     def _proposed(self, features: LruSequence[Features], vocabulary: Vocabulary) -> list[tuple[int, int]]:
-        looks, places = compute_global_descriptors(features, len(features), vocabulary), self._places(features)
+        descriptors, places = compute_global_descriptors(features, len(features), vocabulary), self._places(features)
         allowed = far_apart(len(features), self.config.overlap + 1, places)
-        loops = loop_pairs(GlobalDescriptors((looks,)), allowed, self.config.loop_candidates)
+        loops = loop_pairs(GlobalDescriptors((descriptors,)), allowed, self.config.loop_candidates)
         following = sequential_pairs(places, self.config.overlap)
         firsts = range(0, len(features), places)
         return sorted({*((n + i, n + j) for n in firsts for i, j in following), *loops})
@@ -344,9 +337,9 @@ class StructureFromMotion(Candidates):
         """All views, with points followed through keyframes that hold the path's size badly."""
         weak = weakly_connected(pairs, len(features), self.config.overlap) if len(self.cam_from_rig) == 1 else []
         if weak:
-            told = self.progress.track(weak, "weak keyframes", len(weak))
-            stored = Snapshots(self.snapshots.folder / "bridges")
-            features, pairs = with_bridges(features, pairs, told, lambda k: self.picture(keyframe_ids[k]), stored)
+            tracked = self.progress.track(weak, "weak keyframes", len(weak))
+            stored = self.snapshots.inside("bridges")
+            features, pairs = with_bridges(features, pairs, tracked, lambda k: self.picture(keyframe_ids[k]), stored)
         times = np.array([self.time(k) for k in keyframe_ids])
         given = None if self.given is None else self.given[list(keyframe_ids)]
         return KeyframeSet(features, [f.xy for f in features], times, weak, given), pairs

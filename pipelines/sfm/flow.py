@@ -80,7 +80,7 @@ def _flow(
     return there.reshape(-1, 2).astype(np.float32), status.reshape(-1).astype(bool)
 
 
-def corners(
+def find_corners(
     grey: NDArray[np.uint8], taken: Array, count: int, distance: float = 10.0, left_out: NDArray[np.bool_] | None = None
 ) -> Array:
     """Up to `count` new corners (Q, 2), subpixel, none within `distance` pixels of those taken (R, 2) or each other,
@@ -179,7 +179,7 @@ def _followed(
 ) -> list[Array]:
     """Pixels (Q, 2) of corners of the middle image that are found in both others, in each of the three."""
     (first, hidden_first), (middle, hidden), (last, hidden_last) = pictures
-    xy = corners(middle, np.zeros((0, 2)), _MAX_CORNERS, _DISTANCE, hidden)
+    xy = find_corners(middle, np.zeros((0, 2)), _MAX_CORNERS, _DISTANCE, hidden)
     there, seen = [], np.ones(len(xy), np.bool_)
     sides = (
         (first, hidden_first, features[0], before.matches[:, ::-1]),

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from ..geometry import se3
 from ..geometry.se3 import Similarity, best_rotation
-from .adjust import filter_outliers, median_error, solve
+from .adjust import bundle_adjust, filter_outliers, median_error
+from .components import MIN_POINTS, remove_keyframes
 from .consistency import unexplained
 from .matching import VerifiedPair
-from .seams import MIN_POINTS, remove_keyframes
 
 _LEFT_OUT_PX = 8.0
 """Median errors within which an observation belongs to a point, at most COLMAP's own limits. Of half, once and twice as
@@ -35,7 +35,7 @@ images. Of phones and of SLAM it is below 2 degrees; positions of other frames s
 
 
 @dataclass(frozen=True)
-class Agreement:
+class GivenFit:
     """Fit of given poses to found ones: given = `move`(found); standard deviations of the inliers, in the given unit
     and in degrees; `wrong` (N,): outliers; `scale_sd`: relative; `extent`: root mean square distance of the given
     positions from their middle."""
@@ -53,7 +53,7 @@ class Agreement:
         return self.degrees_sd > _APART_DEGREES or self.position_sd > _APART_SHARE * self.extent
 
 
-def agreement(found: Array, given: Array) -> Agreement | None:
+def fit_given_poses(found: Array, given: Array) -> GivenFit | None:
     """Fit cameras (N, 4, 4) in two worlds by iterated reweighting (Cauchy's weights at the median residual); None where
     fewer than three, or cameras that hardly moved, determine no scale."""
     if len(found) < 3:
@@ -79,7 +79,7 @@ def agreement(found: Array, given: Array) -> Agreement | None:
     wrong = (away > _FAR_OFF * sds[0] + _MIN_SD) | (turned > _FAR_OFF * sds[1] + _MIN_SD)
     move = Similarity(scale, rotation, mean_b - scale * rotation @ mean_a)
     relative_sd = sds[0] / max(scale * np.sqrt(spread), 1e-12)
-    return Agreement(move, sds[0], sds[1], wrong, relative_sd, scale * float(np.sqrt(spread / weight.sum())))
+    return GivenFit(move, sds[0], sds[1], wrong, relative_sd, scale * float(np.sqrt(spread / weight.sum())))
 
 
 def _turns(ours: Array, theirs: Array, rotation: Array) -> Array:
@@ -111,7 +111,7 @@ def posed_model(
         complete_tracks(model, pairs, seed, limit)
         if model.num_points3D() < 2:
             continue
-        solve(model, images, refine_camera and degrees == _TURNS[-1], width=max(1.0, limit / 8))
+        bundle_adjust(model, images, refine_camera and degrees == _TURNS[-1], width=max(1.0, limit / 8))
         pycolmap.ObservationManager(model).filter_all_points3D(max(4.0, limit / 2), 1.0)
     filter_outliers(model)
     _remove_unheld(model)
@@ -119,8 +119,7 @@ def posed_model(
 
 
 def _remove_unheld(model: pycolmap.Reconstruction) -> None:
-    """Remove images that see hardly any point, in place: their poses are still the given ones, and COLMAP's mappers
-    cannot add to a model with an image that no match ties to another."""
+    """Remove images that hardly any point holds, in place: COLMAP's mappers cannot add to a model with such."""
     while unheld := [i - 1 for i in sorted(model.reg_image_ids()) if model.images[i].num_points3D < MIN_POINTS]:
         remove_keyframes(model, unheld)
 

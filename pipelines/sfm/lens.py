@@ -169,8 +169,7 @@ def _distort(camera: pycolmap.Camera, pinhole: Intrinsics, xy: NDArray[np.float6
 
 
 def _turning_radius(camera: pycolmap.Camera, pinhole: Intrinsics) -> float:
-    """Tangent of the least angle to the axis from where on the image of a ray moves back towards the centre, to a 500th
-    of what the pinhole sees; infinite where there is none."""
+    """Tangent of the least angle to the axis beyond which the distortion folds back; infinite where it does not."""
     rays = (_border(pinhole.width, pinhole.height) - [pinhole.cx, pinhole.cy]) / [pinhole.fx, pinhole.fy]
     along = np.linspace(0.0, 1.0, _TURN_STEPS)[:, None, None] * rays
     flat = along.reshape(-1, 2) * [pinhole.fx, pinhole.fy] + [pinhole.cx, pinhole.cy]

@@ -24,7 +24,7 @@ _BELOW_ALL = -(2**24)
 """Below all products of descriptors, which are whole numbers that a float has exactly."""
 _ROWS = 512
 """Of the table of all products: with as many columns as an image has features they stay in the cache."""
-_FIRST_LOOK, _NEARLY = 300, 0.8
+_FIRST_TRIALS, _NEARLY = 300, 0.8
 """Trials of the first look at a pair, and its share of the least inliers: chosen on two recordings."""
 
 
@@ -64,22 +64,20 @@ def match_descriptors(
 def _two_nearest(
     first: Descriptors, second: Descriptors
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
-    """Of every row of `first` the nearest of `second`, its product and the next one's; of every one of `second` the
-    nearest row. Of equal ones the first. Both kinds of product give the same."""
+    """Nearest of `second` to each of `first`, its product and the next one's; and of `first` to each of `second`."""
     table, of_row, of_column = (_byte_products if _has_byte_products() else _float_products)(first, second)
     rows, columns = len(first), len(second)
     found = np.zeros(rows, np.int64), *np.full((2, rows), _BELOW_ALL, np.float32)
     back = np.full(columns, _BELOW_ALL, of_column.dtype), np.zeros(columns, np.int32)
     for start in range(0, rows, _ROWS):
         part = slice(start, start + _ROWS)
-        _look(table(part), start, of_row[part], of_column, *(values[part] for values in found), *back)
+        _scan_rows(table(part), start, of_row[part], of_column, *(values[part] for values in found), *back)
     return *found, back[1]
 
 
 @functools.cache
 def _has_byte_products() -> bool:
-    """Whether the processor adds products of bytes as whole numbers (VNNI): four times as fast as those of floats.
-    Others would do it in pairs that overflow."""
+    """Whether the processor has VNNI: four times as fast as floats; without it sums of pairs overflow."""
     import torch
 
     return bool(getattr(torch.cpu, "_is_vnni_supported", bool)()) and hasattr(torch, "_int_mm")
@@ -110,7 +108,7 @@ def _byte_products(first: Descriptors, second: Descriptors) -> _Products:
 
 
 @kernel
-def _look(table, start, of_row, of_column, best, score, runner_up, column_score, column_best):  # type: ignore[no-untyped-def]
+def _scan_rows(table, start, of_row, of_column, best, score, runner_up, column_score, column_best):  # type: ignore[no-untyped-def]
     """See `_two_nearest`: a part of the rows, in one pass.
 
     Columns lie in `_ABREAST` lanes, each with a best of its own, and nothing branches on a number: loops over the lanes
@@ -198,13 +196,11 @@ def verify_matches(
 
 
 def _may_agree(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
-    """A first look at matched pixels (M, 2), by OpenCV's USAC: whether about enough of them obey one epipolar geometry.
-
-    It takes a millisecond; of pairs with nothing in common each costs the full count of trials for three geometries.
-    Of some pairs of a walk through a house and of a kitchen it refused 100 of 130 of those, and none of 421 others.
-    """
+    """Whether about enough of matched pixels (M, 2) obey one epipolar geometry, by OpenCV's USAC."""
+    # A millisecond; a pair with nothing in common costs the full count of trials for three geometries. Of some pairs of
+    # a walk through a house and of a kitchen it refused 100 of 130 of those, and none of 421 others.
     try:
-        _, inliers = cv2.findFundamentalMat(first, second, cv2.USAC_FAST, _MAX_ERROR, 0.99, _FIRST_LOOK)
+        _, inliers = cv2.findFundamentalMat(first, second, cv2.USAC_FAST, _MAX_ERROR, 0.99, _FIRST_TRIALS)
     except cv2.error:  # it finds no model at all where a camera only turns: that is for the full look to say
         return True
     return inliers is not None and int(inliers.sum()) >= _NEARLY * MIN_INLIERS

@@ -20,7 +20,7 @@ from ...formats.errors import InputError
 from ..geometry import se3
 from ..types import Array, Intrinsics
 from . import bundle_kernels as kernels
-from .adjust import LOSS_SD, adjust, robust_cost, solve
+from .adjust import LOSS_SD, adjust_model, bundle_adjust, robust_cost
 from .bundle import Bundle, Problem, adjust_bundle
 
 Readout = tuple[float, float]
@@ -162,32 +162,37 @@ class RollingModel:
         self.times = times[self.arrays.image_ids - 1]
         self.features = [self.arrays.obs_feature[own] for own in self.arrays.rows()]
         plain = [xy[i - 1][f] for i, f in zip(self.images, self.features, strict=True)]
-        self.plain: Array = np.concatenate([np.zeros((0, 2)), *plain])
-        self.now = self.plain
+        self.raw_xy: Array = np.concatenate([np.zeros((0, 2)), *plain])
+        self.rectified_xy = self.raw_xy
 
     def bundle(self) -> tuple[Bundle, Array, Intrinsics]:
         """Return the bundle in a pinhole's pixels, as the model has them; (O, 2) as the frames do; and the pinhole."""
-        camera, count = self.model.cameras[1], len(self.now)
+        camera, count = self.model.cameras[1], len(self.rectified_xy)
         focal, half = camera.mean_focal_length(), np.array([camera.width, camera.height]) / 2
         pinhole = Intrinsics(camera.width, camera.height, focal, focal, *half)
         at = self.arrays.reread(self.model)
         bundle = Bundle(
             np.ascontiguousarray(at.cam_from_world), at.points, at.obs_cam, at.obs_point,
-            np.asarray(camera.cam_from_img(self.now)) * focal + half,
+            np.asarray(camera.cam_from_img(self.rectified_xy)) * focal + half,
             *(np.broadcast_to(value, count) for value in (LOSS_SD, 0.0, 1.0, -1)),
         )  # fmt: skip
-        return bundle, np.asarray(camera.cam_from_img(self.plain)) * focal + half, pinhole
+        return bundle, np.asarray(camera.cam_from_img(self.raw_xy)) * focal + half, pinhole
+
+    def rectified(self, bundle: Bundle, xy: Array, pinhole: Intrinsics, readout: Readout) -> Bundle:
+        """Return `rectified_bundle` by the velocities of the bundle's own poses."""
+        return rectified_bundle(bundle, xy, pinhole, velocities(bundle.cam_from_world, self.times), readout)
 
     def rectify_observations(self, bundle: Bundle, xy: Array, pinhole: Intrinsics, readout: Readout) -> None:
         """Put the model's observations where they would be in frames taken at once, by `bundle`'s poses and points."""
-        velocity = velocities(bundle.cam_from_world, self.times)
-        now: Array = rectified_bundle(bundle, xy, pinhole, velocity, readout).obs_xy
+        now: Array = self.rectified(bundle, xy, pinhole, readout).obs_xy
         rays = (now - [pinhole.cx, pinhole.cy]) / pinhole.fx
-        self.put(np.asarray(self.model.cameras[1].img_from_cam(np.column_stack([rays, np.ones(len(rays))]))))
+        self.set_observations(
+            np.asarray(self.model.cameras[1].img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+        )
 
-    def put(self, pixels: Array) -> None:
+    def set_observations(self, pixels: Array) -> None:
         """Make (O, 2) `pixels` the model's observations."""
-        self.now, ordered = pixels, iter(pixels)
+        self.rectified_xy, ordered = pixels, iter(pixels)
         for i, features in zip(self.images, self.features, strict=True):
             points = self.model.images[i].points2D
             for k in features.tolist():
@@ -237,12 +242,10 @@ def weigh_readout(rolling: RollingModel, readout: Readout) -> ReadoutEvidence:
     for tried in (NO_READOUT, readout):
         found = bundle
         for _ in range(_ROUNDS - 1 if any(tried) else 1):
-            velocity = velocities(found.cam_from_world, rolling.times)
-            found = rectified_bundle(found, xy, pinhole, velocity, tried)
+            found = rolling.rectified(found, xy, pinhole, tried)
             adjusted = adjust_bundle(found.select(~held), pinhole).bundle
             found = replace(found, cam_from_world=adjusted.cam_from_world, points=adjusted.points)
-        velocity = velocities(found.cam_from_world, rolling.times)
-        errors = rectified_bundle(found, xy, pinhole, velocity, tried).select(held).reprojection_errors(pinhole)
+        errors = rolling.rectified(found, xy, pinhole, tried).select(held).reprojection_errors(pinhole)
         costs.append(robust_cost(errors))
         depths.append(np.maximum(found.points_in_cam()[:, 2], 1e-9))
     change = np.log(depths[1] / depths[0])
@@ -298,7 +301,7 @@ def adjust_rolling(
         axis = readout[0] / seconds, readout[1] / seconds
     for _ in range(_ROUNDS):
         rolling.rectify_observations(*seen, (axis[0] * seconds, axis[1] * seconds))
-        solve(rolling.model, rolling.images, refine_camera, roughly=True)
+        bundle_adjust(rolling.model, rolling.images, refine_camera, roughly=True)
         seen = rolling.bundle()
         if readout is None:
             step, share = estimate(*seen, rolling.times, axis)
@@ -309,6 +312,6 @@ def adjust_rolling(
     ):
         return None
     rolling.rectify_observations(*seen, found)
-    focal_sd = adjust(rolling.model, refine_camera, narrowly)
-    rolling.put(rolling.plain)
+    focal_sd = adjust_model(rolling.model, refine_camera, narrowly)
+    rolling.set_observations(rolling.raw_xy)
     return rolling.model, found, focal_sd

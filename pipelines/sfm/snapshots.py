@@ -1,5 +1,7 @@
 """Snapshots of the features, matches and models found so far, from which a killed run resumes."""
 
+from __future__ import annotations
+
 import errno
 import os
 import shutil
@@ -37,6 +39,11 @@ class Snapshots:
     """Files under one folder; each is whole or missing."""
 
     folder: Path
+
+    def inside(self, name: str) -> Snapshots:
+        """Return the snapshots of a folder inside this one, which is made."""
+        (folder := self.folder / name).mkdir(exist_ok=True)
+        return Snapshots(folder)
 
     def value(self, name: str, compute: Callable[[], T]) -> T:
         """A value, computed unless it is stored."""

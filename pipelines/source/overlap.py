@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.video import VideoFrame
-from ..sfm.flow import corners, follow
+from ..sfm.flow import find_corners, follow
 from .sharpness import reduce_image
 
 _SIDE, _CORNERS, _APART_PX = 240, 60, 8.0
@@ -66,7 +66,7 @@ def _moved(images: list[NDArray[np.uint8]]) -> float:
     way, points = 0.0, np.zeros((0, 2))
     for before, after in itertools.pairwise(images):
         if len(points) < _FEWEST:
-            points = corners(before, np.zeros((0, 2)), _CORNERS, _APART_PX)
+            points = find_corners(before, np.zeros((0, 2)), _CORNERS, _APART_PX)
         if len(points) < _FEWEST:
             continue
         moved, found = follow(before, after, points, points)

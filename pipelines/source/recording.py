@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from ...formats.datasets import Camera, Sequence, open_sequence, recognise_source
 from ...formats.errors import InputError
-from ...formats.exif import ExifLens
 from ...formats.image_folder import list_images, read_image_times, times_file, unread_images
 from ...formats.images import Header, Reading, is_depth_map, is_plain, read_rgb, read_transparent
 from ...formats.reading import (
@@ -33,10 +32,9 @@ from ...formats.reading import (
     require_file,
 )
 from ...formats.video import VideoFrame, VideoReader, probe_video
-from ...formats.video_head import read_equivalent
 from ..run.folder import RunFolder
 from .headers import Headers, common_span, read_headers, require_one_lens
-from .videos import Warn, video_files, warn_of_video
+from .videos import Warn, common_focal, video_files, warn_of_video
 
 WRITTEN_SUFFIXES = (".jpg", ".jpeg", ".png")
 
@@ -198,8 +196,7 @@ class VideoRecording(Recording):
 
     def exif_focal(self) -> float | None:
         """Do as `Recording` says: what the metadata of all files states alike."""
-        stated = {read_equivalent(file) for file in self.files}
-        return ExifLens(equivalent=stated.pop()).focal_px(self.width, self.height) if len(stated) == 1 else None
+        return common_focal(self.files, self.width, self.height)
 
 
 def is_of_source(path: Path, run: RunFolder) -> bool:

@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from ...formats.errors import InputError, install_extra
+from ...formats.exif import ExifLens
 from ...formats.textfile import read_text
 from ...formats.video import VideoReader
-from ...formats.video_head import main_track
+from ...formats.video_head import main_track, read_equivalent
 
 LIST_SUFFIX = ".videos"
 Warn = Callable[[str], None]
@@ -25,6 +26,12 @@ def video_files(path: Path) -> tuple[Path, ...]:
     if not files or LIST_SUFFIX in {file.suffix for file in files}:
         raise InputError(f"{path} names no videos: write the name of one on each line")
     return files
+
+
+def common_focal(videos: Iterable[Path], width: int, height: int) -> float | None:
+    """Return the focal length in pixels that the metadata of all videos state alike; None where they do not."""
+    stated = {read_equivalent(video) for video in videos}
+    return ExifLens(equivalent=stated.pop()).focal_px(width, height) if len(stated) == 1 else None
 
 
 def require_different(videos: Iterable[Path]) -> None:

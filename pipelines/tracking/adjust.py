@@ -16,7 +16,7 @@ from ..geometry import se3
 from ..geometry.camera import project
 from ..geometry.sparse_model import SparseModel
 from ..sfm.bundle import Bundle, adjust_bundle, adjust_pose
-from ..sfm.pose_groups import loose_cameras
+from ..sfm.components import undetermined_cameras
 from ..sfm.rolling import rectified_bundle, rectified_pixels, velocities
 from ..types import Array, Intrinsics, ProxyMaps, rows_by
 from .pnp import MAX_GAP
@@ -111,7 +111,7 @@ def drop_loose(
     state: TrackState, report: Report, intrinsics: Intrinsics, least: int
 ) -> tuple[list[int], list[list[int]]]:
     """Lose, in place, the frames whose poses neither images nor metric depths determine against the rest of their
-    segment, in groups of fewer than `least` keyframes; returns them, and the groups that stay: see `loose_cameras`.
+    segment (`undetermined_cameras`), in groups of fewer than `least` keyframes; return them and the groups that stay.
 
     Frames that were not adjusted themselves go with the keyframes beside them. One or two between others stay.
     """
@@ -123,7 +123,7 @@ def drop_loose(
         parts.setdefault(state.segment[ids[k]], []).append(k)
     keyframes = set(state.keyframes)
     counted = {k for k, i in enumerate(ids) if i in keyframes}
-    found, apart = loose_cameras(report.bundle, intrinsics, parts.values(), least, counted)
+    found, apart = undetermined_cameras(report.bundle, intrinsics, parts.values(), least, counted)
     loose = {ids[k] for k in found}
     others = sorted(set(state.poses).difference(ids))
     loose |= {i for i in others if loose and loose.issuperset(state.nearest_keyframes(i, 1))}

@@ -151,7 +151,7 @@ class _WithAdded(Pictures):
         return number
 
     def features(self, frame_id: int) -> Features:
-        """As of any picture."""
+        """Return the features of a frame, including added ones."""
         return self._added[frame_id] if frame_id in self._added else super().features(frame_id)
 
 

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from ..depth.align import sample_proxy, scale_at_points
 from ..geometry import se3
-from ..geometry.camera import project, unproject
+from ..geometry.camera import nearest_along, project, unproject
 from ..geometry.se3 import best_rotation
 from ..sfm.adjust import FEATURE_SD
-from ..sfm.flow import FLOW_SD, corners, follow
+from ..sfm.flow import FLOW_SD, find_corners, follow
 from ..sfm.matching import match_descriptors
 from ..types import Array, Intrinsics
 from .pictures import Pictures
@@ -164,11 +164,9 @@ def set_rotation_only_poses(state: TrackState, pictures: Pictures, seed: int) ->
 
 
 def _turns(anchor: int, ids: list[int], cam_from_world: Array, pictures: Pictures, seed: int) -> dict[int, Array]:
-    """Poses of the frames `ids`, which lead away from the posed frame `anchor`, as far as rotations reach.
-
-    Each is compared with the farthest frame back that still shows the same: that way a slow walk, which no two
-    neighbours distinguish from a turn, comes to an end.
-    """
+    """Poses of the frames `ids`, which lead away from the posed frame `anchor`, as far as rotations reach."""
+    # Each is compared with the farthest frame back that still shows the same, so that a slow walk, which no two
+    # neighbours distinguish from a turn, comes to an end.
     poses, reference, last = {anchor: cam_from_world}, anchor, anchor
     for i in ids:
         for before in dict.fromkeys((reference, last)):
@@ -193,7 +191,7 @@ def turn_between(first: int, second: int, pictures: Pictures, seed: int) -> Arra
     rotation, agree = fit_rotation(xy1, xy2, camera, np.random.default_rng([seed, first, second]))
     if agree.sum() < _MIN_MATCHES:
         return None
-    here = corners(pictures.grey(first), xy1[agree], _CORNERS, left_out=pictures.left_out(first))
+    here = find_corners(pictures.grey(first), xy1[agree], _CORNERS, left_out=pictures.left_out(first))
     guess, _ = project(_rays(here, camera) @ rotation.T, camera)
     there, found = follow(pictures.grey(first), pictures.grey(second), here, guess)
     found &= pictures.is_scene(second, there)
@@ -211,9 +209,9 @@ def fit_rotation(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """The rotation (3, 3) of the camera that most of the matched pixels (M, 2) obey, and which (M,): RANSAC over pairs
     of matches."""
-    picked = rng.integers(0, len(xy1), (_TRIALS, 2))
+    pairs = rng.integers(0, len(xy1), (_TRIALS, 2))
     rays1, rays2 = _rays(xy1, camera), _rays(xy2, camera)
-    tried = [best_rotation(rays1[p], rays2[p]) for p in picked]
+    tried = [best_rotation(rays1[p], rays2[p]) for p in pairs]
     best = max(tried, key=lambda rotation: int(_agree(rotation, xy1, xy2, camera).sum()))
     return _settle(best, xy1, xy2, camera)
 
@@ -268,7 +266,7 @@ def _from_proxy(frame_id: int, state: TrackState, pictures: Pictures) -> int:
         return 0
     seen, intrinsics = state.sightings[frame_id], pictures.intrinsics
     count = max(NEW_POINTS - len(seen), 0)
-    xy = corners(pictures.grey(frame_id), seen.xy, count, left_out=pictures.left_out(frame_id))
+    xy = find_corners(pictures.grey(frame_id), seen.xy, count, left_out=pictures.left_out(frame_id))
     depth, _ = sample_proxy(maps, xy, intrinsics)
     scale = scale_at_points(maps, seen.xy, state.depths(frame_id), intrinsics, MIN_INLIERS) or 1.0
     good = depth > 0
@@ -282,7 +280,7 @@ def _triangulate(first: int, second: int, state: TrackState, pictures: Pictures)
     """Corners of the first keyframe that are no points yet, followed into the second."""
     taken, intrinsics = state.sightings[first].xy, pictures.intrinsics
     grey = pictures.grey(first)
-    xy = corners(grey, taken, NEW_POINTS, left_out=pictures.left_out(first))
+    xy = find_corners(grey, taken, NEW_POINTS, left_out=pictures.left_out(first))
     motion = state.poses[second] @ se3.inverse(state.poses[first])
     depth = _nearby_depth(first, xy, state)
     guess, _ = project(se3.transform(motion, unproject(xy, depth, intrinsics)), intrinsics)
@@ -317,11 +315,7 @@ def triangulate(
     ray1 /= np.linalg.norm(ray1, axis=1, keepdims=True)
     ray2 /= np.linalg.norm(ray2, axis=1, keepdims=True)
     cosine = (ray1 * ray2).sum(1)
-    # Closest points of two lines; the denominator is the squared sine of their angle.
-    sine2 = np.maximum(1 - cosine**2, 1e-12)
-    along1, along2 = ray1 @ centre2, ray2 @ centre2
-    t1 = (along1 - cosine * along2) / sine2
-    t2 = (cosine * along1 - along2) / sine2
+    t1, t2 = nearest_along(ray1, ray2, centre2, cosine)
     points = (ray1 * t1[:, None] + centre2 + ray2 * t2[:, None]) / 2
     good = (t1 > 0) & (t2 > 0) & (np.arccos(np.clip(cosine, -1, 1)) > MIN_ANGLE)
     for motion, xy in ((np.eye(4), xy1), (cam2_from_cam1, xy2)):
@@ -331,8 +325,7 @@ def triangulate(
 
 
 def _add(points: Array, seen_at: dict[int, Array], state: TrackState, pictures: Pictures) -> None:
-    """New points (Q, 3) with the pixels (Q, 2) at which keyframes see them: the first, of which the colours are, found
-    them, and they were followed into the others."""
+    """Add points (Q, 3), found by the first keyframe at pixels (Q, 2) and followed into the others."""
     first, xy = next(iter(seen_at.items()))
     colors = pictures.color(first)[xy[:, 1].astype(int), xy[:, 0].astype(int)]
     index = state.add_points(points, colors)

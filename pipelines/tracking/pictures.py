@@ -1,8 +1,7 @@
 """Grey images and features of frames, the last few kept in memory."""
 
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
-from typing import Generic, TypeVar
+from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,28 +11,11 @@ from ..config import FramesConfig
 from ..frames.learned import open_learned, picture_features
 from ..run.files import CALIBRATION, FEATURES, FRAMES, VOCABULARY
 from ..run.folder import RunFolder
-from ..sfm.retrieval import describe
+from ..sfm.features import global_descriptor
 from ..sfm.rolling import Shutter
 from ..types import Features, ProxyMaps
 
-T = TypeVar("T")
 _COMPARED_TOGETHER = 64
-
-
-class _Recent(Generic[T]):
-    """The values of a function for the last `size` keys."""
-
-    def __init__(self, make: Callable[[int], T], size: int) -> None:
-        self.make, self.size = make, size
-        self.kept: OrderedDict[int, T] = OrderedDict()
-
-    def __call__(self, key: int) -> T:
-        if key not in self.kept:
-            self.kept[key] = self.make(key)
-            if len(self.kept) > self.size:
-                self.kept.popitem(last=False)
-        self.kept.move_to_end(key)
-        return self.kept[key]
 
 
 def load_shutter(run: RunFolder) -> Shutter:
@@ -51,9 +33,9 @@ class Pictures:
         self.frames = {f.id: f for f in run.load(FRAMES)}
         self.intrinsics = run.load(CALIBRATION).intrinsics
         self._learned = open_learned(settings)
-        self._grey = _Recent(lambda i: to_grey(self.color(i)), kept)
-        self._left_out = _Recent(lambda i: run.left_out(self.frames[i]), kept)
-        self._features = _Recent(self._load_features, 4 * kept)
+        self._grey = lru_cache(kept)(lambda i: to_grey(self.color(i)))
+        self._left_out = lru_cache(kept)(lambda i: run.left_out(self.frames[i]))
+        self._features = lru_cache(4 * kept)(self._load_features)
         # 64 x 128 numbers each. All are asked for again and again in order: of a part of them none would ever be there.
         self._descriptors: dict[int, NDArray[np.float16]] = {}
 
@@ -90,7 +72,7 @@ class Pictures:
 
     def descriptor(self, frame_id: int) -> NDArray[np.float32]:
         """Compute the global descriptor (D,) of a frame, for retrieval."""
-        return describe(self.features(frame_id), self.vocabulary)
+        return global_descriptor(self.features(frame_id), self.vocabulary)
 
     def descriptors(self, keyframes: Sequence[int]) -> NDArray[np.float16]:
         """Return the global descriptors (K, D) of keyframes, which are kept."""

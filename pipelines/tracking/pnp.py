@@ -131,10 +131,10 @@ def relocalise(frame_id: int, state: TrackState, pictures: Pictures, seed: int) 
     a corridor, do not show which of them is seen.
     """
     groups = _candidate_groups(frame_id, state, pictures, CANDIDATES)
-    return recognise(frame_id, groups, state, pictures, seed)
+    return localise_in_groups(frame_id, groups, state, pictures, seed)
 
 
-def recognise(
+def localise_in_groups(
     frame_id: int, groups: list[list[int]], state: TrackState, pictures: Pictures, seed: int
 ) -> tuple[Sightings, FramePose | None]:
     """Relocalise a frame among these groups of keyframes alone; returns what `relocalise` does."""

@@ -12,11 +12,11 @@ from ..engine.stages import StageContext
 from ..geometry import se3
 from ..geometry.se3 import Similarity
 from ..run.files import GIVEN_POSES
-from ..sfm.given import agreement
+from ..sfm.given import fit_given_poses
 from ..system.wording import stretches
 from ..types import Array, GivenPoses
 from .pictures import Pictures
-from .pnp import MIN_INLIERS, group_by_points, recognise
+from .pnp import MIN_INLIERS, group_by_points, localise_in_groups
 from .state import NO_SIGHTINGS, Sightings, TrackState
 
 _MAX_SCALE_SD = 0.1
@@ -70,12 +70,12 @@ def split_segments(state: TrackState) -> None:
 def _join(segment: int, main: int, state: TrackState, pictures: Pictures, seed: int) -> bool:
     ours = [k for k in state.keyframes if state.segment[k] == segment]
     theirs = [k for k in state.keyframes if state.segment[k] == main]
-    looks = pictures.similarities(pictures.descriptors(ours), theirs)
+    similarity = pictures.similarities(pictures.descriptors(ours), theirs)
     answers: list[tuple[int, Similarity, Sightings]] = []
     gap = np.array([np.abs(np.subtract(theirs, a)).min() for a in ours])
     near = np.argsort(gap, kind="stable")[: TRIES // 3].tolist()
-    for n in near + [i for i in np.argsort(-looks.max(1), kind="stable")[:TRIES].tolist() if i not in near]:
-        alike = [theirs[i] for i in np.argsort(-looks[n], kind="stable")[:3]]
+    for n in near + [i for i in np.argsort(-similarity.max(1), kind="stable")[:TRIES].tolist() if i not in near]:
+        alike = [theirs[i] for i in np.argsort(-similarity[n], kind="stable")[:3]]
         alike += [k for k in sorted(theirs, key=lambda k: abs(k - ours[n]))[:2] if k not in alike]
         found = _recognise(ours[n], alike, state, pictures, seed)
         if found is None:
@@ -97,7 +97,7 @@ def _recognise(
 ) -> tuple[Similarity, Sightings] | None:
     """main_from_segment, and the main segment's points in the frame."""
     groups = group_by_points(keyframes, state)
-    seen, solved = recognise(frame_id, groups, state, pictures, seed)
+    seen, solved = localise_in_groups(frame_id, groups, state, pictures, seed)
     if solved is None or solved.inliers.sum() < max(MIN_INLIERS, 0.4 * len(seen)):
         return None
     seen = seen.select(solved.inliers)
@@ -216,7 +216,7 @@ def _to_given(state: TrackState, given: GivenPoses, segment: int) -> Similarity 
     """given_from_state by the posed frames of a segment that have a given pose; None where they determine no scale."""
     ids = [i for i in sorted(state.poses) if state.segment[i] == segment and given.known[i]]
     found = np.array([state.poses[i] for i in ids]).reshape(-1, 4, 4)
-    agreed = agreement(found, given.cam_from_world[ids])
+    agreed = fit_given_poses(found, given.cam_from_world[ids])
     return None if agreed is None or agreed.scale_sd > _MAX_SCALE_SD else agreed.move
 
 
@@ -259,7 +259,7 @@ def _offs(state: TrackState, here: dict[int, Array], posed: list[int]) -> dict[i
     both = [i for i in posed if i in here]
     if not both:
         return {}
-    agreed = agreement(np.array([state.poses[i] for i in both]), np.array([here[i] for i in both]))
+    agreed = fit_given_poses(np.array([state.poses[i] for i in both]), np.array([here[i] for i in both]))
     wrong = np.zeros(len(both), np.bool_) if agreed is None else agreed.wrong
     return {i: state.poses[i] @ se3.inverse(here[i]) for i, bad in zip(both, wrong, strict=True) if not bad}
 

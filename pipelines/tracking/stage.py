@@ -33,10 +33,10 @@ from .pnp import MAX_GAP
 from .segments import carry_given, join_segments, split_segments
 from .state import (
     TrackState,
+    sparse_model_of,
     split_worlds,
     sync_rig_poses,
     to_frame_observations,
-    to_sparse_model,
     to_trajectory,
 )
 
@@ -73,11 +73,11 @@ def run(context: StageContext) -> dict[str, Any]:
 
     trajectory = to_trajectory(state, frames)
     TRAJECTORY.save(context.folder, trajectory)
-    model = to_sparse_model(state)
+    model = sparse_model_of(state)
     SPARSE.save(context.folder, model)
     FRAME_OBSERVATIONS.save(context.folder, to_frame_observations(state))
     DEPTH_FIELDS.save(context.folder, align_depths(model, report, intrinsics, pictures.proxy))
-    figures = {**describe(state, frames, report, metric), **carried}
+    figures = {**stage_figures(state, frames, report, metric), **carried}
     figures["pieces"] = [len(p.poses) for p in pieces]
     if "reference_relative_sd" in proxy:  # what the user's reference leaves open; depths agree far better
         figures["scale_relative_sd"] = proxy["reference_relative_sd"]
@@ -155,14 +155,14 @@ def save_pieces(context: StageContext, pieces: list[TrackState], frames: list[Fr
     for number, piece in enumerate(pieces, 2):
         folder = context.folder / f"piece_{number}"
         TRAJECTORY.save(folder, to_trajectory(piece, frames))
-        SPARSE.save(folder, to_sparse_model(piece))
+        SPARSE.save(folder, sparse_model_of(piece))
         context.warn(
             f"{len(piece.poses)} frames ({stretches(sorted(piece.poses))}) form a disconnected component: they are "
             f"exported separately, as piece_{number}"
         )
 
 
-def describe(state: TrackState, frames: list[Frame], report: Report, metric: bool) -> dict[str, Any]:
+def stage_figures(state: TrackState, frames: list[Frame], report: Report, metric: bool) -> dict[str, Any]:
     """Return the stage's key figures, by name."""
     world = report.ties.world
     return {

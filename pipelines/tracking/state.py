@@ -206,11 +206,11 @@ def split_worlds(state: TrackState, least: int) -> list[TrackState]:
     elsewhere = {s: f"in piece_{n}, which is not connected to the rest" for n, s in enumerate(kept[1:], 2)}
     short = "tracked, but this stretch could not be joined to the rest"
     apart = {i: elsewhere.get(s, short) for i, s in state.segment.items() if s != order[0]}
-    first, *pieces = (_alone(state, segment) for segment in kept)
+    first, *pieces = (_in_own_world(state, segment) for segment in kept)
     return [replace(first, lost=state.lost | apart), *pieces]
 
 
-def _alone(state: TrackState, segment: int) -> TrackState:
+def _in_own_world(state: TrackState, segment: int) -> TrackState:
     inside = [i for i in sorted(state.poses) if state.segment[i] == segment]
     new_from_old = state.poses[inside[0]]
     old_from_new = se3.inverse(new_from_old)
@@ -240,7 +240,7 @@ def to_trajectory(state: TrackState, frames: list[Frame]) -> Trajectory:
     )
 
 
-def to_sparse_model(state: TrackState) -> SparseModel:
+def sparse_model_of(state: TrackState) -> SparseModel:
     """Keyframes and the points that at least two of them see."""
     cam, seen = state.shared_sightings(state.keyframes)
     used, renumbered = np.unique(seen.point, return_inverse=True)
@@ -256,7 +256,7 @@ def to_sparse_model(state: TrackState) -> SparseModel:
 
 
 def to_frame_observations(state: TrackState) -> FrameObservations:
-    """Return where the placed frames that are no keyframes see the points of `to_sparse_model`."""
+    """Return where the placed frames that are no keyframes see the points of `sparse_model_of`."""
     used = np.unique(state.shared_sightings(state.keyframes)[1].point)
     frames = sorted(set(state.poses).difference(state.keyframes, state.turned))
     seen = [state.sightings[i] for i in frames]

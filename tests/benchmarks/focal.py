@@ -29,7 +29,7 @@ from tracking import in_process
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry.camera import ONE_CAMERA
 from msgs_slam.pipelines.geometry.se3 import align_points
-from msgs_slam.pipelines.sfm.candidates import Adjusted, Candidates, KeyframeSet
+from msgs_slam.pipelines.sfm.candidates import AdjustedModel, CandidateModels, KeyframeSet
 from msgs_slam.pipelines.sfm.lens import unknown_camera
 from msgs_slam.pipelines.sfm.matching import VerifiedPair, verify_matches, write_database
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
@@ -159,7 +159,7 @@ def _pair(
     return verify_matches(pair, np.column_stack([a, b]).astype(np.uint32), (xy[i], xy[j]), camera, 0)
 
 
-def recorded(name: str, work: Path) -> tuple[Input, Adjusted | None]:
+def recorded(name: str, work: Path) -> tuple[Input, AdjustedModel | None]:
     """What the stage `frames` gives its mappers of a recording, and what it makes of it."""
     from poses import recordings
     from tracking import COARSE, original_names, prepare
@@ -176,7 +176,7 @@ def recorded(name: str, work: Path) -> tuple[Input, Adjusted | None]:
     got: list[Any] = []
     plain, plain_run = StructureFromMotion._calibrated, StructureFromMotion.run
 
-    def calibrated(self: StructureFromMotion, views: KeyframeSet, pairs: Any) -> Adjusted | None:
+    def calibrated(self: StructureFromMotion, views: KeyframeSet, pairs: Any) -> AdjustedModel | None:
         found = plain(self, views, pairs)
         got[1:] = [views, list(pairs), self.camera, found]
         return found
@@ -235,7 +235,7 @@ def measure(name: str, work: Path) -> dict[str, Any]:
     if name.startswith("walk_"):
         given = walk(int(name.removeprefix("walk_")))
         (snapshots := work / f"{name}_ours").mkdir()
-        candidates = Candidates(
+        candidates = CandidateModels(
             config=FramesConfig(overlap=REACH), camera=given.camera, is_fixed=False, snapshots=Snapshots(snapshots),
             progress=SilentProgress(), seed=0,
         )  # fmt: skip

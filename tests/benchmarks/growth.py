@@ -34,7 +34,7 @@ from msgs_slam.pipelines.geometry.posed_depth import PosedDepth, neighbours
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.candidates import loop_candidates, summarise_labels
 from msgs_slam.pipelines.sfm.bundle import adjust_bundle
-from msgs_slam.pipelines.sfm.retrieval import GlobalDescriptors, far_apart, loop_pairs, unit
+from msgs_slam.pipelines.sfm.features import GlobalDescriptors, far_apart, loop_pairs, unit
 from msgs_slam.pipelines.tracking.adjust import make_bundle
 from msgs_slam.pipelines.tracking.state import TrackState
 from msgs_slam.pipelines.types import Intrinsics

@@ -58,7 +58,7 @@ def _same(position: int) -> Callable[..., Any]:
     return lambda *arguments: arguments[position]
 
 
-_MAP = candidates.Candidates._map
+_MAP = candidates.CandidateModels._map
 
 
 def _first_mapper(self: Any, views: Any, pairs: Any, names: tuple[str, ...] = ("global",)) -> Any:
@@ -67,23 +67,22 @@ def _first_mapper(self: Any, views: Any, pairs: Any, names: tuple[str, ...] = ("
 
 MECHANISMS = {
     "second mapper": Mechanism(
-        candidates.Candidates, "_map", _first_mapper,
+        candidates.CandidateModels, "_map", _first_mapper,
         lambda found, _: found is not None and not found[1].startswith("global"),
-    ),
-    "misplaced removed": Mechanism(
-        candidates, "without_misplaced", _same(0), lambda out, a: out.num_reg_images() < a[0].num_reg_images()
     ),
     "bridges": Mechanism(sfm, "weakly_connected", lambda *_: [], lambda weak, _: bool(weak)),
     "mending of size": Mechanism(
         candidates, "repair_scale_breaks", lambda model, report, *_: (model, report), lambda out, a: out[0] is not a[0]
     ),
     "unfolding": Mechanism(
-        candidates.Candidates, "_remap_from_neighbours", lambda *_: None, lambda found, _: found is not None
+        candidates.CandidateModels, "_remap_from_neighbours", lambda *_: None, lambda found, _: found is not None
     ),
-    "closing": Mechanism(candidates.Candidates, "_close_loops", _same(1), lambda out, a: out is not a[1]),
-    "growing": Mechanism(candidates.Candidates, "_register_remaining", _same(1), lambda out, a: out is not a[1]),
+    "closing": Mechanism(candidates.CandidateModels, "_close_loops", _same(1), lambda out, a: out is not a[1]),
+    "growing": Mechanism(candidates.CandidateModels, "_register_remaining", _same(1), lambda out, a: out is not a[1]),
     "readout": Mechanism(candidates, "adjust_rolling", lambda *_: None, lambda out, _: out is not None),
-    "freeing": Mechanism(candidates.Candidates, "_freed", lambda *_: None, lambda found, _: found is not None),
+    "freeing": Mechanism(
+        candidates.CandidateModels, "_self_calibrate", lambda *_: None, lambda found, _: found is not None
+    ),
     "pieces": Mechanism(sfm.StructureFromMotion, "_pieces", lambda *_: [], lambda found, _: bool(found)),
 }  # fmt: skip
 
@@ -148,7 +147,7 @@ def measured(name: str, form: str, off: str, work: Path) -> dict[str, Any]:
 
 
 def _words(features: Any) -> Any:
-    from msgs_slam.pipelines.sfm.retrieval import learn_vocabulary
+    from msgs_slam.pipelines.sfm.features import learn_vocabulary
 
     return learn_vocabulary(features, 0)
 

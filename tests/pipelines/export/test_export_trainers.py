@@ -24,7 +24,7 @@ from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import FRAME_OBSERVATIONS, LEFT_OUT, SPARSE
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import WORLD, World
-from msgs_slam.pipelines.tracking.state import Sightings, TrackState, to_frame_observations, to_sparse_model
+from msgs_slam.pipelines.tracking.state import Sightings, TrackState, sparse_model_of, to_frame_observations
 
 OracleRun = Callable[..., RunFolder]
 STAGES = ("frames", "proxy", "tracking", "mapping", "export")
@@ -46,7 +46,7 @@ def with_points(run: RunFolder) -> SparseModel:
         key = bool(t.is_keyframe[row])
         xy = xy + 0 if key else np.where(np.arange(len(xy))[:, None] < WRONG, xy + 30, xy)
         state.add_frame(frame_id, t.cam_from_world[row], Sightings.of(point, xy, 1.0), key, 0)
-    model = to_sparse_model(state)
+    model = sparse_model_of(state)
     SPARSE.save(run.stage("tracking"), model)
     FRAME_OBSERVATIONS.save(run.stage("tracking"), to_frame_observations(state))
     return model

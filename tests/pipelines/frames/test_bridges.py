@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from msgs_slam.pipelines.sfm.features import global_descriptor, learn_vocabulary
 from msgs_slam.pipelines.sfm.flow import MIN_SHARED, Picture, bridged, weakly_connected
 from msgs_slam.pipelines.sfm.matching import VerifiedPair, match_features
-from msgs_slam.pipelines.sfm.retrieval import describe, learn_vocabulary
 from msgs_slam.pipelines.types import Features
 
 STEP = np.array([9.0, -4.0])
@@ -91,7 +91,7 @@ def test_a_corner_is_like_nothing(weak: tuple[list[Features], list[VerifiedPair]
     found, _ = _bridged(weak, lambda k: (_picture(k), None))
     assert match_features(found[0], found[1]).max() < 40
     vocabulary = learn_vocabulary(features, 0)
-    assert np.array_equal(describe(found[1], vocabulary), describe(features[1], vocabulary))
+    assert np.array_equal(global_descriptor(found[1], vocabulary), global_descriptor(features[1], vocabulary))
 
 
 def test_pictures_without_corners_change_nothing(weak: tuple[list[Features], list[VerifiedPair]]) -> None:

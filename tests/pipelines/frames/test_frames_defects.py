@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 
 from msgs_slam.pipelines.frames.defects import noise_of, shift_of_images
-from msgs_slam.pipelines.sfm.adjust import adjust
+from msgs_slam.pipelines.sfm.adjust import adjust_model
 from msgs_slam.pipelines.sfm.given import bare_model, complete_tracks
 from msgs_slam.pipelines.sfm.lens import unknown_camera
 from msgs_slam.pipelines.types import Features
@@ -24,7 +24,7 @@ def adjusted(shift: float) -> pycolmap.Reconstruction:
     moved = MadeViews(made.cam_from_world, features, made.seen)
     model = bare_model(camera, [f.xy for f in features], made.cam_from_world)
     complete_tracks(model, moved.pairs(camera), 0, 4 * shift + 4)
-    adjust(model, refine_camera=False)
+    adjust_model(model, refine_camera=False)
     return model
 
 

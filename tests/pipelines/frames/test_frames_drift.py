@@ -4,8 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from msgs_slam.pipelines.sfm.consistency import judge
-from msgs_slam.pipelines.sfm.drift import MAX_DRIFT, ScaleDrift, scale_drift
+from msgs_slam.pipelines.sfm.consistency import MAX_DRIFT, ScaleDrift, judge, scale_drift
 from msgs_slam.pipelines.sfm.given import bare_model
 from msgs_slam.pipelines.sfm.lens import unknown_camera
 from msgs_slam.pipelines.sfm.matching import VerifiedPair

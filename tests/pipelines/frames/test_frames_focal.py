@@ -11,9 +11,9 @@ import pytest
 
 from msgs_slam.formats.datasets.sequence import Camera
 from msgs_slam.pipelines.frames.findings import warn_of_focal
-from msgs_slam.pipelines.sfm import focal as focal_module
-from msgs_slam.pipelines.sfm.focal import _errors, _rotation, calibrated, two_view_lens
+from msgs_slam.pipelines.sfm import two_views
 from msgs_slam.pipelines.sfm.lens import to_pycolmap, unknown_camera
+from msgs_slam.pipelines.sfm.two_views import _errors, _rotation, calibrated, two_view_lens
 from tests.pipelines.frames.made_views import MadeViews, structure_of, walk_round
 
 SIZE = (640, 480)
@@ -80,7 +80,7 @@ def test_the_lens_of_a_path_is_found_and_none_where_there_is_none(focal: float, 
 
 def test_a_bad_start_from_pairs_is_not_the_last_word(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = walk_round(to_pycolmap(Camera(*SIZE, 520.0, 520.0, 320.0, 240.0)), 16)
-    monkeypatch.setattr(focal_module, "two_view_lens", lambda *_: (2.5 * 520.0, 0.0))
+    monkeypatch.setattr(two_views, "two_view_lens", lambda *_: (2.5 * 520.0, 0.0))
     found = structure_of(made, GUESS, tmp_path, is_fixed=False)._calibrated(made.views(), made.pairs(GUESS))
     assert found is not None
     assert found.model.cameras[1].focal_length == pytest.approx(520, rel=0.01)

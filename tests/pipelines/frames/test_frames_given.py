@@ -21,7 +21,7 @@ from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import GIVEN_POSES
 from msgs_slam.pipelines.sfm.candidates import GIVEN, _selection_score
 from msgs_slam.pipelines.sfm.consistency import ModelReport
-from msgs_slam.pipelines.sfm.given import agreement, posed_model
+from msgs_slam.pipelines.sfm.given import fit_given_poses, posed_model
 from msgs_slam.pipelines.sfm.lens import to_pycolmap, unknown_camera
 from msgs_slam.pipelines.source.given import given_poses
 from msgs_slam.pipelines.source.recording import open_recording
@@ -52,12 +52,12 @@ def test_agreement_tells_scale_noise_and_what_is_absurd() -> None:
     known = np.isfinite(given).all(axis=(1, 2))
     ours = made.cam_from_world[known].copy()
     ours[:, :3, 3] /= 2.5
-    found = agreement(ours, given[known])
+    found = fit_given_poses(ours, given[known])
     assert found is not None
     assert found.move.scale == pytest.approx(2.5, rel=0.04)
     assert found.position_sd * np.sqrt(3) == pytest.approx(0.05, rel=0.4)
     assert np.flatnonzero(known)[found.wrong].tolist() == [7]
-    assert agreement(ours[:2], given[:2]) is None
+    assert fit_given_poses(ours[:2], given[:2]) is None
 
 
 def test_only_poses_that_contradict_all_of_a_sound_structure_are_refused(tmp_path: Path) -> None:

@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.sfm import pose_groups as module
+from msgs_slam.pipelines.sfm import components as module
 from msgs_slam.pipelines.sfm.adjust import FEATURE_SD
 from msgs_slam.pipelines.sfm.bundle import Bundle, adjust_bundle
+from msgs_slam.pipelines.sfm.components import MAX_SD, pose_groups, relative_sds, undetermined_cameras
 from msgs_slam.pipelines.sfm.given import posed_model
-from msgs_slam.pipelines.sfm.pose_groups import MAX_SD, loose_cameras, pose_groups, relative_sds
 from msgs_slam.pipelines.sfm.rolling import RollingModel
 from msgs_slam.pipelines.types import Intrinsics
 from tests.pipelines.frames.made_views import MadeViews, structure_of, walk_along_bare_wall, walk_round
@@ -103,11 +103,11 @@ def test_what_is_seen_again_far_off_holds(strip: tuple[Bundle, Intrinsics], monk
 
 def test_few_are_loose_and_many_are_a_group_of_their_own(strip: tuple[Bundle, Intrinsics]) -> None:
     every = range(28)
-    assert loose_cameras(*strip, [every], 2, every) == (STRIP, [])
-    assert loose_cameras(*strip, [every], 1, every) == ([], [[k] for k in STRIP])
-    assert loose_cameras(*strip, [every], 1, range(12, 28)) == (STRIP, [])  # none of them counts
+    assert undetermined_cameras(*strip, [every], 2, every) == (STRIP, [])
+    assert undetermined_cameras(*strip, [every], 1, every) == ([], [[k] for k in STRIP])
+    assert undetermined_cameras(*strip, [every], 1, range(12, 28)) == (STRIP, [])  # none of them counts
     half = range(20)  # twelve of twenty are loose: which are right?
-    assert loose_cameras(*strip, [half], 2, every) == ([], [STRIP])
+    assert undetermined_cameras(*strip, [half], 2, every) == ([], [STRIP])
 
 
 def test_structure_from_motion_leaves_them_out(tmp_path: Path) -> None:

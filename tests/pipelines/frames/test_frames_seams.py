@@ -10,24 +10,22 @@ import pytest
 
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.findings import warn_of_structure
-from msgs_slam.pipelines.sfm.adjust import adjust
-from msgs_slam.pipelines.sfm.consistency import ModelReport, judge
-from msgs_slam.pipelines.sfm.driver import Structure
-from msgs_slam.pipelines.sfm.seams import (
+from msgs_slam.pipelines.sfm.adjust import adjust_model
+from msgs_slam.pipelines.sfm.components import (
     PairCheck,
     Seam,
     cut,
-    find_misplaced,
-    find_parts,
+    find_components,
     find_seams,
     remove_keyframes,
     tracks_of,
     worst_contradictions,
 )
+from msgs_slam.pipelines.sfm.consistency import ModelReport, judge
+from msgs_slam.pipelines.sfm.driver import Structure
 from msgs_slam.pipelines.types import Vocabulary
 
 COUNT, REACH = 40, 4
-NO_WORDS = Vocabulary(np.zeros((1, 128)), np.zeros(128))
 
 
 def _checks(torn_at: int) -> list[PairCheck]:
@@ -50,7 +48,7 @@ def test_one_contradicted_seam_among_many_good_ones() -> None:
     assert not any(s.is_weak_link for s in seams)
 
 
-def test_things_that_repeat_contradict_no_seam_and_misplace_nobody() -> None:
+def test_things_that_repeat_contradict_no_seam() -> None:
     """Most pairs across a corner are false, but those of neighbours have most of the matches."""
     rows = []
     for i in range(COUNT):
@@ -62,28 +60,11 @@ def test_things_that_repeat_contradict_no_seam_and_misplace_nobody() -> None:
     assert corner.pairs == 10
     assert 0.65 < corner.agreement < 0.75
     assert worst_contradictions(seams) == []
-    assert find_misplaced(rows, REACH) == []
 
 
 def test_far_pairs_say_nothing_of_a_seam() -> None:
     far = [PairCheck(5, 35, 400, 0)] * 50
     assert not any(s.is_contradicted for s in find_seams(range(COUNT), _checks(0) + far, _tracks(), REACH))
-
-
-def _elsewhere(lost: set[int]) -> list[PairCheck]:
-    """Pairs of neighbours that agree unless one of the two, but not both, is placed elsewhere."""
-    return [PairCheck(c.first, c.second, 100, 95 if (c.first in lost) == (c.second in lost) else 3) for c in _checks(0)]
-
-
-@pytest.mark.parametrize("lost", [set(), {17, 18}, {0}, {30, 31, 32}, {38, 39}, {3, 20}])
-def test_views_that_their_neighbours_contradict_are_misplaced(lost: set[int]) -> None:
-    far = [PairCheck(k, k + 20, 400, 400) for k in range(20)]
-    assert set(find_misplaced(_elsewhere(lost) + far, REACH)) == lost
-
-
-def test_a_fold_misplaces_nobody() -> None:
-    assert find_misplaced(_checks(torn_at=25), REACH) == []
-    assert find_misplaced(_elsewhere(set(range(10, 22))), REACH) == []
 
 
 def test_what_is_taken_out_leaves_no_observation(made_model: pycolmap.Reconstruction) -> None:
@@ -94,12 +75,12 @@ def test_what_is_taken_out_leaves_no_observation(made_model: pycolmap.Reconstruc
     assert 50 < len(tracks) <= before
     assert not any({4, 7} & set(t) for t in tracks)
     focal = made_model.cameras[1].focal_length
-    assert 0 <= adjust(made_model, refine_camera=True) < 0.01 * focal
+    assert 0 <= adjust_model(made_model, refine_camera=True) < 0.01 * focal
     assert made_model.cameras[1].focal_length == pytest.approx(focal, rel=0.001)
 
 
 def test_a_model_of_nothing_has_no_part() -> None:
-    assert find_parts([], find_seams([], [], [], REACH), [], REACH) == []
+    assert find_components([], find_seams([], [], [], REACH), [], REACH) == []
     model = pycolmap.Reconstruction()
     model.add_camera(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 300.0, 320, 240))
     report = judge(model, [], [], 4, REACH)
@@ -113,7 +94,7 @@ def test_keyframes_that_were_not_placed_leave_a_gap() -> None:
     seams = find_seams(placed, checks, tracks, REACH)
     assert Seam(9, 13, 20, 4, 1.0) not in seams  # points of four neighbours reach 12 at most
     assert next(s for s in seams if s.before == 9).is_weak_link
-    assert find_parts(placed, seams, tracks, REACH) == [list(range(13, COUNT)), list(range(10))]
+    assert find_components(placed, seams, tracks, REACH) == [list(range(13, COUNT)), list(range(10))]
 
 
 def test_where_two_structures_share_one_keyframe_alone_nothing_holds_their_sizes() -> None:
@@ -121,7 +102,7 @@ def test_where_two_structures_share_one_keyframe_alone_nothing_holds_their_sizes
     row = [t for t in _tracks() if t[-1] <= 20 or t[0] >= 20]
     seams = find_seams(range(COUNT), _checks(0), row, REACH)
     assert [s.points for s in seams[19:21]] == [0, 20]  # before the keyframe, and behind it
-    assert [len(p) for p in find_parts(range(COUNT), seams, row, REACH)] == [20, 20]
+    assert [len(p) for p in find_components(range(COUNT), seams, row, REACH)] == [20, 20]
     tied = row + [[19, 20, 21]] * 12
     assert not any(s.is_weak_link for s in find_seams(range(COUNT), _checks(0), tied, REACH))
     skipping = row + [[19, 21]] * 50  # directions from one to the other, but no size
@@ -131,7 +112,7 @@ def test_where_two_structures_share_one_keyframe_alone_nothing_holds_their_sizes
 def test_a_loop_holds_two_runs_together() -> None:
     for loop, parts in ((None, [25, 15]), ((2, 38), [COUNT])):
         tracks = _tracks(25, loop)
-        found = find_parts(range(COUNT), find_seams(range(COUNT), _checks(0), tracks, REACH), tracks, REACH)
+        found = find_components(range(COUNT), find_seams(range(COUNT), _checks(0), tracks, REACH), tracks, REACH)
         assert [len(p) for p in found] == parts
 
 
@@ -164,48 +145,25 @@ def _seam(before: int, points: int = 50, agreement: float = 0.9) -> Seam:
 
 
 @pytest.mark.parametrize(
-    ("seams", "parts", "wanted"),
+    ("placed", "pairs_agreeing", "seams", "parts", "loose", "wanted"),
     [
-        ([_seam(0)], [range(9)], []),
-        ([_seam(4, agreement=0.1)], [range(9)], ["folded between frames 8-10"]),
-        ([_seam(4, points=0)], [range(5), range(5, 9)], ["2 disconnected parts .* 0-8, 10-16"]),
-        ([_seam(7, points=0)], [range(8), [8]], [r"1 keyframes .* \(frames 16\)"]),
+        (9, 0.99, [_seam(0)], [range(9)], [], []),
+        (9, 0.99, [_seam(4, agreement=0.1)], [range(9)], [], ["folded between frames 8-10"]),
+        (9, 0.99, [_seam(4, points=0)], [range(5), range(5, 9)], [], ["2 disconnected parts .* 0-8, 10-16"]),
+        (9, 0.99, [_seam(7, points=0)], [range(8), [8]], [], [r"1 keyframes .* \(frames 16\)"]),
+        (9, 0.69, [_seam(0)], [range(9)], [], ["far apart contradict .* 69% of the matched pairs"]),
+        (6, 0.99, [_seam(5)], [range(3, 9)], [0, 1],
+         ["could not place 3 of 9 keyframes", r"2 of them \(frames 0, 2\) show too little to determine their poses"]),
     ],
-    ids=["sound", "folded", "two parts", "one alone"],
-)
+    ids=["sound", "folded", "two parts", "one alone", "far pairs contradict", "left out"],
+)  # fmt: skip
 def test_what_is_wrong_is_said(
-    seams: list[Seam],
-    parts: list[list[int]],
-    wanted: list[str],
-    make_context: Callable[..., StageContext],
-    tmp_path: Path,
-) -> None:
-    report = ModelReport(9, 9, 500, 0.3, 0.99, 0.99, tuple(seams), tuple(map(tuple, parts)))
-    context = make_context(tmp_path)
-    warn_of_structure(
-        context,
-        Structure(pycolmap.Reconstruction(), report, "global", 0.0, [], NO_WORDS, [], [], []),
-        list(range(0, 18, 2)),
-    )
+    placed: int, pairs_agreeing: float, seams: list[Seam], parts: list[list[int]], loose: list[int], wanted: list[str],
+    make_context: Callable[..., StageContext], tmp_path: Path,
+) -> None:  # fmt: skip
+    report = ModelReport(placed, 9, 500, 0.3, 0.99, pairs_agreeing, tuple(seams), tuple(map(tuple, parts)))
+    context, words = make_context(tmp_path), Vocabulary(np.zeros((1, 128)), np.zeros(128))
+    structure = Structure(pycolmap.Reconstruction(), report, "global", 0.0, [], words, [], [], [], loose=loose)
+    warn_of_structure(context, structure, list(range(0, 18, 2)))
     assert len(context.warnings) == len(wanted)
     assert all(re.search(pattern, said) for pattern, said in zip(wanted, context.warnings, strict=True))
-
-
-def test_pairs_far_apart_that_contradict_are_no_fold(make_context: Callable[..., StageContext], tmp_path: Path) -> None:
-    report = ModelReport(9, 9, 500, 0.3, 0.8, 0.69, (_seam(0),), (tuple(range(9)),))
-    context = make_context(tmp_path)
-    warn_of_structure(
-        context, Structure(pycolmap.Reconstruction(), report, "global", 0.0, [], NO_WORDS, [], [], []), list(range(9))
-    )
-    assert len(context.warnings) == 1
-    assert re.search("far apart contradict .* 69% of the matched pairs", context.warnings[0])
-
-
-def test_keyframes_that_were_left_out_are_named(make_context: Callable[..., StageContext], tmp_path: Path) -> None:
-    report = ModelReport(6, 9, 500, 0.3, 1.0, 1.0, (_seam(5),), (tuple(range(3, 9)),))
-    context = make_context(tmp_path)
-    structure = Structure(pycolmap.Reconstruction(), report, "global", 0.0, [], NO_WORDS, [], [], [], loose=[0, 1])
-    warn_of_structure(context, structure, list(range(0, 18, 2)))
-    assert len(context.warnings) == 2
-    assert "could not place 3 of 9 keyframes" in context.warnings[0]
-    assert "2 of them (frames 0, 2) show too little to determine their poses" in context.warnings[1]

@@ -10,11 +10,11 @@ import pytest
 
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.sfm.bundle import Bundle
-from msgs_slam.pipelines.sfm.candidates import Adjusted, KeyframeSet
+from msgs_slam.pipelines.sfm.candidates import AdjustedModel, KeyframeSet
 from msgs_slam.pipelines.sfm.driver import StructureFromMotion
+from msgs_slam.pipelines.sfm.joining import WindowModels, found_readout
 from msgs_slam.pipelines.sfm.rolling import NO_READOUT, Readout
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
-from msgs_slam.pipelines.sfm.windows import WindowModels, found_readout
 from msgs_slam.pipelines.system.memory import windows_of
 from msgs_slam.pipelines.system.parallel import LruSequence
 from msgs_slam.pipelines.system.progress import SilentProgress
@@ -33,13 +33,13 @@ def of_window(bundle: Bundle, window: range) -> pycolmap.Reconstruction:
 
 def in_windows(
     readouts: Sequence[Readout | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, readout: float = READOUT
-) -> tuple[Adjusted | None, list[pycolmap.Reconstruction], list[str]]:
+) -> tuple[AdjustedModel | None, list[pycolmap.Reconstruction], list[str]]:
     """The joined windows of a held camera, each of which has found another readout, or (None) nothing; and what was
     warned of."""
     bundle, warned = seen_by(readout)[0], []
     xy = [bundle.obs_xy[bundle.obs_cam == k] for k in range(COUNT)]
     found = {
-        w: None if r is None else Adjusted(of_window(bundle, w), "global", 0.0, 1.0, r)
+        w: None if r is None else AdjustedModel(of_window(bundle, w), "global", 0.0, 1.0, r)
         for w, r in zip(WINDOWS, readouts, strict=True)
     }
     monkeypatch.setattr(StructureFromMotion, "_window", lambda self, window, views, pairs: found[window])

@@ -17,13 +17,20 @@ from msgs_slam.pipelines.run.ending import checksums
 from msgs_slam.pipelines.run.files import CALIBRATION
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.manifest import Manifest, Source, StageRecord, write_manifest
-from msgs_slam.pipelines.sfm.adjust import adjust, reprojection_errors
+from msgs_slam.pipelines.sfm.adjust import adjust_model, model_errors
 from msgs_slam.pipelines.sfm.consistency import judge
+from msgs_slam.pipelines.sfm.joining import (
+    WIDE,
+    Joined,
+    adjust_together,
+    merge_loop_points,
+    repair_scale_breaks,
+    rescale_after,
+    scale_ratio,
+)
 from msgs_slam.pipelines.sfm.lens import unknown_camera
 from msgs_slam.pipelines.sfm.matching import VerifiedPair
 from msgs_slam.pipelines.sfm.rolling import NO_READOUT
-from msgs_slam.pipelines.sfm.scale_repair import repair_scale_breaks, rescale_after, scale_ratio
-from msgs_slam.pipelines.sfm.windows import WIDE, Joined, adjust_together, close_loops
 from msgs_slam.pipelines.system.memory import WINDOW, WINDOW_OVERLAP, window_size, windows_of
 from msgs_slam.pipelines.types import Calibration, Intrinsics
 from tests.world.paths import look_at
@@ -114,7 +121,7 @@ def test_windows_of_three_worlds_become_one_model() -> None:
     found = np.array([whole.images[i].projection_center() for i in range(1, COUNT + 1)])
     wanted = se3.inverse(path())[:, :3, 3]
     assert np.linalg.norm(align_points(found, wanted).apply(found) - wanted, axis=1).max() < 0.01
-    assert float(np.median(reprojection_errors(whole))) == pytest.approx(0.55, abs=0.1)
+    assert float(np.median(model_errors(whole))) == pytest.approx(0.55, abs=0.1)
 
 
 def drifted() -> tuple[pycolmap.Reconstruction, list[Array]]:
@@ -144,14 +151,14 @@ def test_a_loop_between_windows_is_closed() -> None:
     )
     assert apart() > 0.1
     points = model.num_points3D()
-    merged = close_loops(model, pairs, [range(COUNT), range(COUNT, 2 * COUNT)], xy)
+    merged = merge_loop_points(model, pairs, [range(COUNT), range(COUNT, 2 * COUNT)], xy)
     assert merged > 300
     assert model.num_points3D() == points - merged
     times = np.arange(2 * COUNT) / 10
     adjust_together(model, xy, times, NO_READOUT, WIDE)
     adjust_together(model, xy, times, NO_READOUT)
     assert apart() < 0.005
-    assert close_loops(model, pairs, [range(2 * COUNT)], xy) == 0
+    assert merge_loop_points(model, pairs, [range(2 * COUNT)], xy) == 0
 
 
 def test_windows_that_share_too_little_are_not_joined() -> None:
@@ -221,7 +228,7 @@ def test_points_a_pixel_off_have_no_say_in_a_narrow_adjustment() -> None:
     wanted, errors = se3.inverse(path())[:, :3, 3], []
     for narrowly in (False, True):
         tried = pycolmap.Reconstruction(model)
-        adjust(tried, refine_camera=False, narrowly=narrowly)
+        adjust_model(tried, refine_camera=False, narrowly=narrowly)
         found = np.array([tried.images[i].projection_center() for i in range(1, COUNT + 1)])
         errors.append(np.linalg.norm(align_points(found, wanted).apply(found) - wanted, axis=1).mean())
     assert errors[1] < 0.5 * errors[0]

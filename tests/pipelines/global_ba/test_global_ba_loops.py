@@ -24,7 +24,7 @@ from msgs_slam.pipelines.global_ba.candidates import (
 )
 from msgs_slam.pipelines.global_ba.close import close_loops, reprojection_error
 from msgs_slam.pipelines.global_ba.loops import FoundLoops, KeyframeView, find_loops, make_view, verify_loop
-from msgs_slam.pipelines.sfm.retrieval import GlobalDescriptors, describe, learn_vocabulary
+from msgs_slam.pipelines.sfm.features import GlobalDescriptors, global_descriptor, learn_vocabulary
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.state import TrackState
 from msgs_slam.pipelines.types import Features, Intrinsics
@@ -50,7 +50,7 @@ class Walk:
     def pairs(self, refused: Collection[tuple[int, int]] = ()) -> list[tuple[int, int]]:
         nothing = [summarise_labels(np.full((4, 4), 255, np.uint8), 3)] * len(self.features)
         vocabulary = learn_vocabulary(self.features, 0)
-        looks = GlobalDescriptors((np.stack([describe(f, vocabulary) for f in self.features]),))
+        looks = GlobalDescriptors((np.stack([global_descriptor(f, vocabulary) for f in self.features]),))
         return loop_candidates(self.model, looks, nothing, refused)
 
     def find(self) -> FoundLoops:
@@ -264,7 +264,7 @@ def test_the_same_place_looks_alike_and_others_by_chance() -> None:
     places = [np.abs(rng.normal(size=(200, 128))) for _ in range(6)]
     frames = [seen(places[i]) for i in (0, 1, 2, 3, 4, 5, 0)]
     vocabulary = learn_vocabulary(frames, 0)
-    vectors = np.stack([describe(f, vocabulary) for f in frames])
+    vectors = np.stack([global_descriptor(f, vocabulary) for f in frames])
     scores = vectors @ vectors[0]
     assert scores[1:6].max() < 0 < 0.5 < scores[6]
     assert np.allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-5)

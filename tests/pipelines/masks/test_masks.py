@@ -21,15 +21,15 @@ from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_input
 from msgs_slam.pipelines.geometry.voxels import to_lab
 from msgs_slam.pipelines.mapping.objective import Objective
 from msgs_slam.pipelines.mapping.views import View, make_view
-from msgs_slam.pipelines.masks.moving import MovingView, find_moving, look_once
+from msgs_slam.pipelines.masks.moving import MovingView, find_moving, find_moving_once
 from msgs_slam.pipelines.masks.people import PeopleFinder, join_people, people_cards
-from msgs_slam.pipelines.masks.static import judge, parts_of, regions_of, things_of
+from msgs_slam.pipelines.masks.static import divide_regions, judge_static, regions_of, things_of
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.providers import DepthEstimate, LabelEstimate
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.render.api import Rendering
-from msgs_slam.pipelines.sfm.features import extract_features
-from msgs_slam.pipelines.sfm.flow import corners
+from msgs_slam.pipelines.sfm.features import sift_features
+from msgs_slam.pipelines.sfm.flow import find_corners
 from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame, Intrinsics
@@ -107,10 +107,10 @@ def test_changed_masks_are_seen(pictures: Path, tmp_path: Path) -> None:
 
 def test_features_corners_and_keyframes_keep_clear() -> None:
     grey = np.asarray(cv2.cvtColor(noise(), cv2.COLOR_RGB2GRAY), np.uint8)
-    found, kept = (extract_features(grey, 500, mask) for mask in (None, left_half()))
+    found, kept = (sift_features(grey, 500, mask) for mask in (None, left_half()))
     assert 5 < len(kept) < len(found)
     assert (kept.xy[:, 0] >= WIDTH // 2 - 1).all()
-    assert (corners(grey, np.zeros((0, 2)), 50, left_out=left_half())[:, 0] > WIDTH // 2 - 4).all()
+    assert (find_corners(grey, np.zeros((0, 2)), 50, left_out=left_half())[:, 0] > WIDTH // 2 - 4).all()
     # Only what is masked moves: by it alone every frame would be a keyframe.
     shown = [np.where(left_half(), np.roll(grey, 9 * i, 1), grey) for i in range(4)]
     still = choose_keyframes([(g, left_half()) for g in shown], 0.05)
@@ -239,7 +239,7 @@ def test_a_statue_and_who_walks_past_it_are_two_parts_of_one_outline() -> None:
 
     def divided(stands: NDArray[np.bool_], every: int) -> NDArray[np.int32]:
         seen = (region > 0) & (np.arange(region.size).reshape(region.shape) % every == 0)
-        return parts_of(region, np.stack([seen & stands, seen]).reshape(2, -1).astype(np.float64), 0.5)
+        return divide_regions(region, np.stack([seen & stands, seen]).reshape(2, -1).astype(np.float64), 0.5)
 
     left, right = (region > 0) & (column < 72), (region > 0) & (column > 78)
     parts = divided(column < 75, 7)
@@ -260,7 +260,7 @@ def test_who_walks_away_is_left_out_where_she_stood_before() -> None:
         count = [0 if s is None else 100 for s in shares]
         votes = [np.array([[0, (s or 0) * n], [0, n]]) if r.any() else np.zeros((2, 1))
                  for s, n, r in zip(shares, count, regions, strict=True)]  # fmt: skip
-        return [int(s[1]) for s, r in zip(judge(votes, things, expected), regions, strict=True) if r.any()]
+        return [int(s[1]) for s, r in zip(judge_static(votes, things, expected), regions, strict=True) if r.any()]
 
     stands = [0.7, 0.75, 0.8, 0.7, None, 0.7, 0.72, 0.7, None, None]
     assert judged(stands) == [1] * 7 + [0]
@@ -363,7 +363,7 @@ def clip(stands_at: float | None) -> tuple[list[MovingView], list[NDArray[np.boo
 def find(views: list[MovingView]) -> dict[int, NDArray[np.bool_]]:
     poses = np.array([v.cam_from_world for v in views])
     shown = poses, lambda k: views[k], CAMERA, SilentProgress()
-    return find_moving(*shown, look_once(range(len(views)), *shown))
+    return find_moving(*shown, find_moving_once(range(len(views)), *shown))
 
 
 def test_a_thing_that_walks_along_a_wall_is_found() -> None:

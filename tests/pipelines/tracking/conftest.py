@@ -18,7 +18,7 @@ from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, CLASSES, PROXY_MAPS, save_frames
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.sfm.bundle import Bundle
-from msgs_slam.pipelines.sfm.flow import corners
+from msgs_slam.pipelines.sfm.flow import find_corners
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, ClassTable, Frame, Intrinsics, ProxyMaps
 from tests.pipelines.kept import keep_correspondences
@@ -134,7 +134,7 @@ def _backbone(
     rng = np.random.default_rng(1)
     points, colors = [], []
     for k in keyframes[::2]:
-        xy = corners(to_grey(frames[k].rgb), np.zeros((0, 2)), 150)
+        xy = find_corners(to_grey(frames[k].rgb), np.zeros((0, 2)), 150)
         row, column = xy[:, 1].astype(int), xy[:, 0].astype(int)
         in_cam = unproject(xy, frames[k].depth[row, column].astype(float), intrinsics)
         world_from_cam = np.linalg.inv(truth[k])

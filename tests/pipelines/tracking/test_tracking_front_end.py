@@ -9,8 +9,8 @@ import pytest
 
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
-from msgs_slam.pipelines.sfm.features import extract_features
-from msgs_slam.pipelines.sfm.flow import corners, follow
+from msgs_slam.pipelines.sfm.features import sift_features
+from msgs_slam.pipelines.sfm.flow import find_corners, follow
 from msgs_slam.pipelines.sfm.matching import match_descriptors
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.front_end import triangulate
@@ -30,7 +30,7 @@ def test_flow_measures_a_subpixel_shift() -> None:
     first = texture(0)
     shift = np.array([3.3, -2.6])
     moved = cv2.warpAffine(first, np.array([[1, 0, shift[0]], [0, 1, shift[1]]]), (260, 200), flags=cv2.INTER_CUBIC)
-    xy = corners(first, np.zeros((0, 2)), 60)
+    xy = find_corners(first, np.zeros((0, 2)), 60)
     inner = (np.abs(xy - [130, 100]) < [100, 70]).all(1)
     there, found = follow(first, moved, xy[inner], xy[inner].copy())
     error = np.linalg.norm(there[found] - xy[inner][found] - shift, axis=1)
@@ -39,7 +39,7 @@ def test_flow_measures_a_subpixel_shift() -> None:
 
 
 def test_flow_refuses_what_is_not_there() -> None:
-    xy = corners(texture(0), np.zeros((0, 2)), 60)
+    xy = find_corners(texture(0), np.zeros((0, 2)), 60)
     _, found = follow(texture(0), texture(1), xy, xy.copy())
     assert found.mean() < 0.2
     _, found = follow(texture(0), texture(0), xy, np.full_like(xy, np.nan))
@@ -48,7 +48,7 @@ def test_flow_refuses_what_is_not_there() -> None:
 
 def test_corners_keep_their_distance() -> None:
     taken = np.array([[50.0, 50.0], [100.0, 80.0]])
-    xy = corners(texture(2), taken, 100, distance=12)
+    xy = find_corners(texture(2), taken, 100, distance=12)
     assert len(xy) > 20
     assert np.linalg.norm(xy[:, None] - taken, axis=2).min() > 9
 
@@ -135,7 +135,7 @@ def test_no_pose_from_nonsense() -> None:
 def test_features_match_a_turned_picture_and_not_another() -> None:
     first = texture(3, (300, 300))
     turned = np.ascontiguousarray(np.rot90(first))
-    a, b, other = (extract_features(x, 400, threshold=0.005) for x in (first, turned, texture(4, (300, 300))))
+    a, b, other = (sift_features(x, 400, threshold=0.005) for x in (first, turned, texture(4, (300, 300))))
     pairs = match_descriptors(a.descriptors, b.descriptors)
     # (x, y) goes to (y, 300 - x) in a picture turned to the left.
     wanted = np.stack([a.xy[pairs[:, 0], 1], 300 - a.xy[pairs[:, 0], 0]], 1)

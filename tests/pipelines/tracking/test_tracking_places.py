@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.geometry.camera import CUBE, Rig, rig_of, tie_cameras
+from msgs_slam.pipelines.geometry.camera import CUBE, Rig, reduce_to_rig, rig_of
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.sfm.bundle import Bundle, adjust_bundle
 from msgs_slam.pipelines.tracking.segments import split_segments
@@ -61,7 +61,7 @@ def test_tied_blocks_are_the_system_in_the_places_steps() -> None:
     pairs = np.argwhere(np.triu(np.ones((12, 12))) > 0)
     blocks = np.array([full[6 * a : 6 * a + 6, 6 * b : 6 * b + 6] for a, b in pairs])
     right = rng.normal(size=72)
-    tied, kept, pull, place, turns = tie_cameras(blocks, pairs, right, ids, RIG)
+    tied, kept, pull, place, turns = reduce_to_rig(blocks, pairs, right, ids, RIG)
     count = len(np.unique(ids % STATIONS))
     steps = np.zeros((72, 6 * count))
     for camera in range(12):

@@ -9,7 +9,7 @@ import pytest
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import unproject
 from msgs_slam.pipelines.geometry.se3 import Similarity
-from msgs_slam.pipelines.sfm.features import extract_features
+from msgs_slam.pipelines.sfm.features import sift_features
 from msgs_slam.pipelines.tracking.pnp import relocalise
 from msgs_slam.pipelines.tracking.segments import agree
 from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
@@ -29,7 +29,7 @@ class OnePicture:
     intrinsics = CAMERA
 
     def __init__(self) -> None:
-        self._features = extract_features(picture(), 400, threshold=0.005)
+        self._features = sift_features(picture(), 400, threshold=0.005)
 
     def features(self, frame_id: int) -> Any:
         return self._features

@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from msgs_slam.pipelines.run.files import (
     SPARSE,
     TRAJECTORY,
 )
-from msgs_slam.pipelines.sfm.retrieval import describe
+from msgs_slam.pipelines.sfm.features import global_descriptor
 from msgs_slam.pipelines.tracking import adjust, pictures, segments, stage
 from msgs_slam.pipelines.tracking.stage import run as run_tracking
 from msgs_slam.pipelines.tracking.stage import stretches
@@ -35,13 +36,29 @@ from msgs_slam.pipelines.tracking.state import TrackState
 from msgs_slam.pipelines.types import GivenPoses
 from tests.pipelines.tracking.conftest import MadeRun
 
+Track = Callable[..., tuple[MadeRun, dict[str, Any], list[str]]]
 
-def finish(context: StageContext) -> dict:
-    """Run the stage and put its folder in place, as the runner does."""
-    figures = run_tracking(context)
-    shutil.rmtree(context.folder / "snapshot", ignore_errors=True)
-    context.folder.rename(context.run.stage("tracking"))
-    return figures
+
+@pytest.fixture
+def track(tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]) -> Track:
+    """track(change, config, folder, **made): a run is made and changed, the stage run, its folder put in place as by
+    the runner; the run, its figures and its warnings."""
+
+    def finish(
+        change: Callable[[MadeRun], object] = lambda _: None,
+        config: Config | None = None,
+        folder: str = "run",
+        **made: Any,
+    ) -> tuple[MadeRun, dict[str, Any], list[str]]:
+        found = make_run(tmp_path / folder, **made)
+        change(found)
+        context = open_stage(found.run, "tracking", config)
+        figures = run_tracking(context)
+        shutil.rmtree(context.folder / "snapshot", ignore_errors=True)
+        context.folder.rename(found.run.stage("tracking"))
+        return found, figures, context.warnings
+
+    return finish
 
 
 def trajectory_error(made: MadeRun, scale: bool) -> float:
@@ -52,11 +69,8 @@ def trajectory_error(made: MadeRun, scale: bool) -> float:
     return float(np.sqrt(((moved - truth) ** 2).sum(1).mean()))
 
 
-def test_poses_every_frame_in_metres(
-    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
-) -> None:
-    made = make_run(tmp_path / "run")
-    figures = finish(open_stage(made.run, "tracking"))
+def test_poses_every_frame_in_metres(track: Track) -> None:
+    made, figures, _ = track()
     assert figures["posed"] == 24
     assert figures["scale"] == "metric"
     # Frames of 320 x 240 in a room of metres: millimetres, but never exact.
@@ -67,16 +81,12 @@ def test_poses_every_frame_in_metres(
 
 
 def test_given_poses_of_which_no_frame_could_be_posed_are_no_motion(
-    tmp_path: Path,
-    make_run: Callable[..., MadeRun],
-    open_stage: Callable[..., StageContext],
-    monkeypatch: pytest.MonkeyPatch,
+    track: Track, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = make_run(tmp_path / "run")
-    GIVEN_POSES.save(made.run.stage("frames"), GivenPoses(np.full((24, 4, 4), np.nan), True, "made up"))
+    given = GivenPoses(np.full((24, 4, 4), np.nan), True, "made up")
     monkeypatch.setattr(stage, "track_frames", lambda *_: TrackState())
     with pytest.raises(InputError, match="no camera motion could be recovered from 24 frames"):
-        run_tracking(open_stage(made.run, "tracking"))
+        track(lambda made: GIVEN_POSES.save(made.run.stage("frames"), given))
 
 
 def test_a_keyframe_is_described_once_however_often_frames_are_compared_with_it(
@@ -88,9 +98,9 @@ def test_a_keyframe_is_described_once_however_often_frames_are_compared_with_it(
 
     def counted(*given: Any) -> np.ndarray:
         described.append(len(described))
-        return describe(*given)
+        return global_descriptor(*given)
 
-    monkeypatch.setattr(pictures, "describe", counted)
+    monkeypatch.setattr(pictures, "global_descriptor", counted)
     context = open_stage(made.run, "tracking")
     looked_up = pictures.Pictures(made.run, context.config.frames)
     keyframes = list(range(0, 24, 2))
@@ -121,11 +131,8 @@ def test_stretches_are_compared_again_only_with_what_has_joined_since(monkeypatc
     assert set(state.segment.values()) == {0, 1, 5}
 
 
-def test_sparse_model_reprojects_and_scales_are_right(
-    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
-) -> None:
-    made = make_run(tmp_path / "run", depth_factor=1.25)
-    finish(open_stage(made.run, "tracking"))
+def test_sparse_model_reprojects_and_scales_are_right(track: Track) -> None:
+    made, _, _ = track(depth_factor=1.25)
     model = SPARSE.read(made.run.stage("tracking") / "sparse.npz")
     camera = made.run.load(CALIBRATION).intrinsics
     pose, point = model.cam_from_world[model.obs_frame], model.points_in_world[model.obs_point]
@@ -155,55 +162,40 @@ def scale_error(made: MadeRun, expected: float) -> float:
     return float(np.mean([np.abs(fields.scales(i, 24, 32) / expected - 1) for i in fields.of_frame]))
 
 
-def test_scale_free_proxies_leave_the_world_as_it_is(
-    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
-) -> None:
-    made = make_run(tmp_path / "run", backbone_scale=0.4, metric=False)
-    figures = finish(open_stage(made.run, "tracking"))
+def test_scale_free_proxies_leave_the_world_as_it_is(track: Track) -> None:
+    made, figures, _ = track(backbone_scale=0.4, metric=False)
     assert figures["scale"] == "free"
     assert 0 < scale_error(made, 0.4) < 0.02
 
 
-def test_frames_outside_the_adjustment_follow_it(
-    tmp_path: Path,
-    make_run: Callable[..., MadeRun],
-    open_stage: Callable[..., StageContext],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_frames_outside_the_adjustment_follow_it(track: Track, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(adjust, "MAX_FRAMES", 12)
-    made = make_run(tmp_path / "run", backbone_scale=0.4)
-    figures = finish(open_stage(made.run, "tracking"))
+    made, figures, _ = track(backbone_scale=0.4)
     assert figures["adjusted_frames"] == 9
     assert figures["posed"] == 24
     assert 0 < trajectory_error(made, scale=False) < 0.01
 
 
-def test_a_frame_without_picture_is_lost_and_named(
-    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
-) -> None:
-    made = make_run(tmp_path / "run", blank=(7, 8))
-    context = open_stage(made.run, "tracking")
-    figures = finish(context)
+def test_a_frame_without_picture_is_lost_and_named(track: Track) -> None:
+    made, figures, warnings = track(blank=(7, 8))
     assert figures["posed"] == 22
     assert set(figures["lost"]) == {"7", "8"}
-    assert any("7-8" in w for w in context.warnings)
+    assert any("7-8" in w for w in warnings)
     assert all("agree" in reason for reason in figures["lost"].values())
     assert 0 < trajectory_error(made, scale=False) < 0.01
 
 
 def test_interrupted_work_ends_with_the_same_bytes(
-    tmp_path: Path,
-    make_run: Callable[..., MadeRun],
-    open_stage: Callable[..., StageContext],
-    monkeypatch: pytest.MonkeyPatch,
+    track: Track, open_stage: Callable[..., StageContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(stage, "SNAPSHOT_EVERY", 5)
-    whole, broken = make_run(tmp_path / "a"), make_run(tmp_path / "b")
-    finish(open_stage(whole.run, "tracking"))
-    with pytest.raises(KeyboardInterrupt):
-        run_tracking(interrupted(open_stage(broken.run, "tracking"), after=13))
-    assert (broken.run.partial("tracking") / "snapshot" / "state.npz").exists()
-    finish(open_stage(broken.run, "tracking"))
+
+    def interrupt(broken: MadeRun) -> None:
+        with pytest.raises(KeyboardInterrupt):
+            run_tracking(interrupted(open_stage(broken.run, "tracking"), after=13))
+        assert (broken.run.partial("tracking") / "snapshot" / "state.npz").exists()
+
+    whole, broken = track(folder="a")[0], track(interrupt, folder="b")[0]
     for name in ("trajectory.npz", "sparse.npz", "depth_fields.npz", "tracking.json"):
         assert (whole.run.stage("tracking") / name).read_bytes() == (broken.run.stage("tracking") / name).read_bytes()
 
@@ -221,24 +213,13 @@ def interrupted(context: StageContext, after: int) -> StageContext:
     return StageContext(context.run, context.source, context.config, context.folder, Breaking())
 
 
-def test_works_without_structure_from_motion(
-    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+@pytest.mark.parametrize("keyframes", [(), (8, 11, 14)])
+def test_works_without_structure_from_motion_and_goes_on_where_it_ends(
+    keyframes: tuple[int, ...], track: Track
 ) -> None:
-    made = make_run(tmp_path / "run", keyframes=(), all_proxies=True)
-    figures = finish(open_stage(made.run, "tracking"))
-    assert figures["posed"] == 24
-    assert figures["pieces"] == []
-    assert 2 <= figures["keyframes"] <= 12
-    assert 0 < trajectory_error(made, scale=False) < 0.02
-
-
-def test_goes_on_where_structure_from_motion_ends(
-    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
-) -> None:
-    made = make_run(tmp_path / "run", keyframes=(8, 11, 14), all_proxies=True, backbone_scale=0.4)
-    figures = finish(open_stage(made.run, "tracking"))
-    assert figures["posed"] == 24
-    assert figures["pieces"] == []
+    made, figures, _ = track(keyframes=keyframes, all_proxies=True)
+    assert (figures["posed"], figures["pieces"]) == (24, [])
+    assert 2 <= figures["keyframes"] <= 12 or keyframes
     assert 0 < trajectory_error(made, scale=False) < 0.02
 
 
@@ -260,44 +241,35 @@ def in_two_parts(model: SparseModel, first_of_second: int) -> SparseModel:
     )  # fmt: skip
 
 
-def test_parts_of_structure_from_motion_are_joined_where_they_recognise_each_other(
-    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
-) -> None:
-    made = make_run(tmp_path / "run", metric=False)
+def split_at(first_of_second: int, made: MadeRun) -> None:
     model = made.run.find(BACKBONE)
     assert model is not None
-    BACKBONE.save(made.run.stage("frames"), in_two_parts(model, 12))
-    context = open_stage(made.run, "tracking")
-    figures = finish(context)
-    assert figures["posed"] == 24
-    assert figures["pieces"] == []
+    BACKBONE.save(made.run.stage("frames"), in_two_parts(model, first_of_second))
+
+
+def test_parts_of_structure_from_motion_are_joined_where_they_recognise_each_other(track: Track) -> None:
+    made, figures, _ = track(partial(split_at, 12), metric=False)
+    assert (figures["posed"], figures["pieces"]) == (24, [])
     assert 0 < trajectory_error(made, scale=True) < 0.02
 
 
-def test_a_part_that_shows_another_place_is_not_glued_on(
-    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
-) -> None:
-    made = make_run(tmp_path / "run", metric=False)
-    model = made.run.find(BACKBONE)
-    assert model is not None
-    BACKBONE.save(made.run.stage("frames"), in_two_parts(model, 15))
-    for frame in made.run.load(FRAMES)[14:]:  # upside down and mirrored, as good as another room
-        path = made.run.stage("frames") / frame.name
-        write_rgb(path, np.ascontiguousarray(read_rgb(path)[::-1]))
-    context = open_stage(made.run, "tracking")
-    figures = finish(context)
+def test_a_part_that_shows_another_place_is_not_glued_on(track: Track) -> None:
+    def split_and_mirror(made: MadeRun) -> None:
+        split_at(15, made)
+        for frame in made.run.load(FRAMES)[14:]:  # upside down and mirrored, as good as another room
+            path = made.run.stage("frames") / frame.name
+            write_rgb(path, np.ascontiguousarray(read_rgb(path)[::-1]))
+
+    made, figures, warnings = track(split_and_mirror, metric=False)
     assert figures["posed"] == 14
     assert set(figures["lost"]) == {str(i) for i in range(14, 24)}
-    assert any("15-23" in w and "piece_2" in w for w in context.warnings)
+    assert any("15-23" in w and "piece_2" in w for w in warnings)
     assert 0 < trajectory_error(made, scale=True) < 0.01
 
 
-def test_nothing_to_go_by_is_refused(
-    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
-) -> None:
-    made = make_run(tmp_path / "run", keyframes=())
+def test_nothing_to_go_by_is_refused(track: Track) -> None:
     with pytest.raises(InputError, match="Possible causes: a camera that stands still or only turns"):
-        run_tracking(open_stage(made.run, "tracking", Config()))
+        track(keyframes=())
 
 
 def test_stretches() -> None:
@@ -309,25 +281,23 @@ OTHERS = (15, 18, 21, 23)
 """Keyframes of a second model; their pictures and those between are blank, so that nobody recognises anything."""
 
 
-def track(made: MadeRun, open_stage: Callable[..., StageContext], least: int) -> tuple[dict, list[str]]:
-    context = open_stage(made.run, "tracking", load_config(overrides=[f"frames.least_piece={least}"]))
-    figures = run_tracking(context)
-    context.folder.rename(made.run.stage("tracking"))
-    return figures, context.warnings
-
-
-def test_a_second_model_becomes_a_piece(
-    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
+@pytest.mark.parametrize("hidden", [True, False])
+def test_a_second_model_becomes_a_piece_unless_the_pictures_join_it(
+    hidden: bool, track: Track, make_run: Callable[..., MadeRun], tmp_path: Path
 ) -> None:
-    made = make_run(tmp_path / "run", keyframes=(0, 3, 6, 9), blank=tuple(range(10, 24)))
-    model = make_run(tmp_path / "other", keyframes=OTHERS, backbone_scale=0.7).run.find(BACKBONE)
-    assert model is not None
-    SPARSE.save(made.run.stage("frames") / "piece_2", model)
-    figures, warnings = track(made, open_stage, least=4)
+    other = make_run(tmp_path / "other", keyframes=OTHERS, backbone_scale=0.7).run.find(BACKBONE)
+    assert other is not None
+    made, figures, warnings = track(
+        lambda made: SPARSE.save(made.run.stage("frames") / "piece_2", other),
+        load_config(overrides=["frames.least_piece=4"]),
+        keyframes=(0, 3, 6, 9), blank=tuple(range(10, 24)) if hidden else (),
+    )  # fmt: skip
+    if not hidden:
+        assert (figures["pieces"], figures["posed"]) == ([], 24)
+        return
     assert figures["pieces"] == [4]
     assert figures["posed"] >= 10
     assert any("piece_2" in w and "15, 18, 21, 23" in w for w in warnings)
-
     assert not set(np.flatnonzero(made.run.load(TRAJECTORY, "tracking").is_posed)) & set(OTHERS)
     piece = made.run.load(TRAJECTORY, "tracking", piece="piece_2")
     assert np.flatnonzero(piece.is_posed).tolist() == [*OTHERS]
@@ -335,14 +305,3 @@ def test_a_second_model_becomes_a_piece(
     found, truth = piece.centers[piece.is_posed], np.linalg.inv(made.cam_from_world[[*OTHERS]])
     moved = align_points(found, truth[:, :3, 3], with_scale=True).apply(found)
     assert 0 < np.linalg.norm(moved - truth[:, :3, 3], axis=1).max() < 0.02
-
-
-def test_what_the_pictures_join_is_no_piece(
-    tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext]
-) -> None:
-    made = make_run(tmp_path / "run", keyframes=(0, 3, 6, 9))
-    model = make_run(tmp_path / "other", keyframes=OTHERS, backbone_scale=0.7).run.find(BACKBONE)
-    assert model is not None
-    SPARSE.save(made.run.stage("frames") / "piece_2", model)
-    figures, _ = track(made, open_stage, least=4)
-    assert (figures["pieces"], figures["posed"]) == ([], 24)

@@ -1,4 +1,4 @@
-"""The focal length that pairs of views tell, before there is a model.
+"""What pairs of views tell before there is a model: the focal length, and whether the camera moved or only turned.
 
 Two views agree by a fundamental matrix whatever the focal length, but by a relative pose only at the right one. So the
 best relative pose of every pair is found at each of a row of focal lengths, and the one at which all pairs together
@@ -17,7 +17,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from ...formats.errors import InputError
 from ..geometry import se3
+from ..geometry.se3 import best_rotation
 from .matching import MIN_INLIERS, VerifiedPair
 
 Array = NDArray[np.float64]
@@ -30,10 +32,10 @@ _ROUNDS = 10
 _MAX_ERROR = 0.6
 """Pixels within which a match obeys a relative pose. With 1 the keyframes of six of seven recordings are farther from
 the truth, by up to a quarter, and of one 2 % nearer."""
-_BENDS, _BETWEEN = (-0.3, -0.2, -0.1, 0.1), 0.05
-"""Of a pixel at a corner of the image, by how much farther in or out it would be without distortion."""
+_DISTORTIONS, _BETWEEN = (-0.3, -0.2, -0.1, 0.1), 0.05
+"""Relative radial displacement at the image corner (division model)."""
 _WIDE = 12
-"""So many of the focal lengths are those of lenses that bend: up to 1.5 longer sides."""
+"""So many of the focal lengths are those of lenses that distortion: up to 1.5 longer sides."""
 _MIN_GAIN = 0.02
 """Share of the cost that a bend must explain to be one."""
 _UNCALIBRATED = int(pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED)
@@ -50,18 +52,18 @@ def calibrated(
     if camera.has_prior_focal_length:
         return camera, pairs
     found, size = pycolmap.Camera(camera.todict()), (camera.width, camera.height)
-    focal, bend = two_view_lens(pairs, xy, size) or (camera.mean_focal_length(), 0.0)
+    focal, distortion = two_view_lens(pairs, xy, size) or (camera.mean_focal_length(), 0.0)
     found.params, found.has_prior_focal_length = [focal, *camera.params[1:]], True
-    if bend:
-        found.params = [*found.params[:3], bend * (2 * focal / np.hypot(*size)) ** 2]
-    return found, _with_poses(pairs, xy, size, focal, bend)
+    if distortion:
+        found.params = [*found.params[:3], distortion * (2 * focal / np.hypot(*size)) ** 2]
+    return found, _with_poses(pairs, xy, size, focal, distortion)
 
 
 def two_view_lens(
     pairs: Sequence[VerifiedPair], xy: Sequence[Array], size: tuple[int, int]
 ) -> tuple[float, float] | None:
     """Estimate the focal length, in pixels, of a camera of this size (width, height) from verified pairs of views with
-    features xy (F, 2), and how much it bends, see `_BENDS`; None where no pair has an epipolar geometry."""
+    features xy (F, 2), and its distortion, see `_DISTORTIONS`; None where no pair has an epipolar geometry."""
     telling = [p for p in pairs if p.config == _UNCALIBRATED]
     if not telling:
         return None
@@ -70,21 +72,21 @@ def two_view_lens(
     fundamental, first, second = _sampled(chosen, xy, size)
     focals = _FOCALS * max(size)
 
-    def costs(bend: float, steps: range) -> Array:
-        x, y = _unbent(first, size, bend), _unbent(second, size, bend)
-        scale = 1 + bend * _outwards(second, size)[..., 0].mean()  # of pixels there, in pixels here
+    def costs(distortion: float, steps: range) -> Array:
+        x, y = _undistort(first, size, distortion), _undistort(second, size, distortion)
+        scale = 1 + distortion * _outwards(second, size)[..., 0].mean()  # of pixels there, in pixels here
         out = np.full(len(focals), np.inf)
         out[steps] = [count @ _best_poses(fundamental, x, y, f, scale)[2] for f in focals[steps]]
         return out
 
     wide = range(_WIDE)
     straight = costs(0.0, range(len(focals)))
-    found = {bend: costs(bend, wide) for bend in _BENDS}
-    best = min(found, key=lambda bend: found[bend].min())
+    found = {distortion: costs(distortion, wide) for distortion in _DISTORTIONS}
+    best = min(found, key=lambda distortion: found[distortion].min())
     if found[best].min() > (1 - _MIN_GAIN) * straight.min():
         return _vertex(straight, focals), 0.0
-    found |= {bend: costs(bend, wide) for bend in (best - _BETWEEN, best + _BETWEEN)}
-    best = min(found, key=lambda bend: found[bend].min())
+    found |= {distortion: costs(distortion, wide) for distortion in (best - _BETWEEN, best + _BETWEEN)}
+    best = min(found, key=lambda distortion: found[distortion].min())
     return _vertex(found[best], focals), best
 
 
@@ -103,13 +105,13 @@ def _outwards(pixels: Array, size: tuple[int, int]) -> Array:
     return (pixels**2).sum(-1, keepdims=True) / (np.array(size) ** 2).sum() * 4
 
 
-def _unbent(pixels: Array, size: tuple[int, int], bend: float) -> Array:
+def _undistort(pixels: Array, size: tuple[int, int], distortion: float) -> Array:
     """Pixels (..., 2) from the image's centre where they would be without distortion."""
-    return pixels / (1 + bend * _outwards(pixels, size))
+    return pixels / (1 + distortion * _outwards(pixels, size))
 
 
 def _with_poses(
-    pairs: Sequence[VerifiedPair], xy: Sequence[Array], size: tuple[int, int], focal: float, bend: float
+    pairs: Sequence[VerifiedPair], xy: Sequence[Array], size: tuple[int, int], focal: float, distortion: float
 ) -> list[VerifiedPair]:
     """The pairs, those of a fundamental matrix with the essential one at a focal length."""
     wanted = [p for p in pairs if p.config == _UNCALIBRATED]
@@ -117,21 +119,22 @@ def _with_poses(
     for start in range(0, len(wanted), _PAIRS):
         block = wanted[start : start + _PAIRS]
         fundamental, first, second = _sampled(block, xy, size)
-        u, v, _ = _best_poses(fundamental, _unbent(first, size, bend), _unbent(second, size, bend), focal)
-        posed = (_with_pose(*pair, xy, size, focal, bend) for pair in zip(block, u, v, strict=True))
+        u, v, _ = _best_poses(
+            fundamental, _undistort(first, size, distortion), _undistort(second, size, distortion), focal
+        )
+        posed = (_with_pose(*pair, xy, size, focal, distortion) for pair in zip(block, u, v, strict=True))
         out += [p for p in posed if p is not None]
     return sorted(out, key=lambda p: (p.first, p.second))
 
 
 def _with_pose(
-    pair: VerifiedPair, u: Array, v: Array, xy: Sequence[Array], size: tuple[int, int], focal: float, bend: float
+    pair: VerifiedPair, u: Array, v: Array, xy: Sequence[Array], size: tuple[int, int], focal: float, distortion: float
 ) -> VerifiedPair | None:
-    """A pair with the essential matrix of U and V, without the matches that contradict it; None if too few are left. Of
-    a lens that bends all stay: it is known too roughly to judge by."""
+    """A pair with the essential matrix of U and V and the matches that obey it (all, with distortion), if enough."""
     middle, numbers = np.array(size) / 2, zip((pair.first, pair.second), pair.matches.T, strict=True)
     x, y = (_rays(xy[k][features] - middle, focal)[None] for k, features in numbers)
     error, _ = _errors(u[None], v[None], x, y)
-    matches = pair.matches[(np.abs(error[0]) * focal < _MAX_ERROR) | (bend != 0)]
+    matches = pair.matches[(np.abs(error[0]) * focal < _MAX_ERROR) | (distortion != 0)]
     if len(matches) < MIN_INLIERS:
         return None
     essential = u * _IN_PLANE @ v.T
@@ -158,11 +161,8 @@ def _evenly(count: int, wanted: int) -> NDArray[np.int64]:
 def _best_poses(
     fundamental: Array, first: Array, second: Array, focal: float, pixel: float = 1.0
 ) -> tuple[Array, Array, Array]:
-    """U and V (P, 3, 3) of the essential matrices U diag(1, 1, 0) V^T that explain matches, pixels (P, M, 2) from the
-    image's centre, best, and the mean robust epipolar errors (P,) that are left, in units of 1 / `pixel`.
-
-    From fundamental matrices (P, 3, 3), by Levenberg-Marquardt: turning U, and V in two directions, gives all others.
-    """
+    """U and V (P, 3, 3) of the essential matrices U diag(1, 1, 0) V^T best for pixels (P, M, 2); their costs."""
+    # Levenberg-Marquardt from the fundamental matrices: turning U, and V in two directions, gives all others.
     x, y = _rays(first, focal), _rays(second, focal)
     scale = np.diag([focal, focal, 1.0])
     u, _, v = np.linalg.svd(scale @ fundamental @ scale)
@@ -210,3 +210,114 @@ def _rotation(turn: Array) -> Array:
 def _cost(pixels: Array) -> Array:
     """(P,) means of Cauchy's loss at a pixel's width."""
     return np.log1p(pixels**2).mean(1)
+
+
+# parallax --------------------------------------------------------------------------------------------------------
+
+HOW_TO_FILM = (
+    "Film again while walking: move the camera sideways by a tenth of the distance to what it shows, rather than "
+    "turning on the spot"
+)
+_MOVING_FRACTION = 0.01
+_TURN_ONLY_PX = 1.5
+_MIN_DISPLACEMENT_PX = 10.0
+_SAMPLED_PAIRS = 40
+_MAX_MATCH = 0.9
+_FEWEST_VIEWS = 3
+_COARSE_FOCALS = np.geomspace(0.4, 4.0, 13)
+_FINE_FACTORS = np.geomspace(0.85, 1.18, 9)
+
+
+def require_motion(largest_displacement: float, has_detail: bool) -> None:
+    """Raise InputError for a camera that does not move, displacement as a fraction of the image's width and
+    height, and for images without detail."""
+    if not has_detail:
+        raise InputError(
+            "no image shows detail that could be followed into another one: they are dark, of plain surfaces, or out "
+            "of focus. Look at them; more light, or a view with furniture in it, gives detail"
+        )
+    if largest_displacement < _MOVING_FRACTION:
+        raise InputError(
+            f"there is no parallax: over the whole source the image moves by at most {largest_displacement:.2%} of "
+            f"its width or height, so no depth can be found. Either the camera stands still, or the images are all the "
+            f"same: look at them. {HOW_TO_FILM}"
+        )
+
+
+def require_parallax(
+    pairs: Sequence[VerifiedPair], xy: Sequence[NDArray[np.float64]], size: tuple[int, int], focal: float | None
+) -> None:
+    """Raise InputError when turning on the spot explains all matches; size = (width, height).
+
+    `focal` in pixels where it is known; else every plausible one is tried, so that no wrong guess of it can hide a
+    pure rotation.
+    """
+    moved = [p for p in pairs if _displacement(p, xy) > _MIN_DISPLACEMENT_PX]
+    if not moved:
+        return
+    moved = moved[:: max(1, len(moved) // _SAMPLED_PAIRS)]
+    unexplained = _least_unexplained(moved, xy, size, focal)
+    if unexplained < _TURN_ONLY_PX:
+        raise InputError(
+            f"there is no parallax: turning the camera on the spot explains all matches of {len(moved)} pairs of views "
+            f"to {unexplained:.1f} px, so no depth can be found. {HOW_TO_FILM}"
+        )
+
+
+def why_no_structure(views: int, pairs: Sequence[VerifiedPair]) -> str:
+    """Say what may be wrong where no model was found of so many views, and what the matching pairs rule out."""
+    if views < _FEWEST_VIEWS:
+        return (
+            f"{views} images are too few: one pair of them does not tell how the camera moved and what its focal "
+            f"length is. Take at least {_FEWEST_VIEWS - views} more of the same place, each a step further to the side"
+        )
+    matched = len({view for pair in pairs for view in (pair.first, pair.second)})
+    if matched < _MAX_MATCH * views:
+        return (
+            f"no structure could be found among {views} views; pairs that match: {len(pairs)}. {views - matched} views "
+            "match no other. Possible causes: too little overlap, plain surfaces, blur, darkness, or things that move. "
+            "Film more slowly, in better light, or give images closer together"
+        )
+    return (
+        f"no structure could be found among {views} views; pairs that match: {len(pairs)}. {matched} views match "
+        "others, which rules out blur and plain surfaces. Possible causes: different lenses, zooms or crops among the "
+        "images, a fisheye lens (--camera fisheye, --intrinsics), a camera that hardly moves sideways, or things that "
+        "move and fill the image"
+    )
+
+
+def _least_unexplained(
+    pairs: Sequence[VerifiedPair], xy: Sequence[NDArray[np.float64]], size: tuple[int, int], focal: float | None
+) -> float:
+    """Pixels that rotations leave in nine tenths of the pairs, at the best focal length."""
+    # Not half: someone who turns slowly with the camera at arm's length has parallax in few pairs only.
+
+    def unexplained(f: float) -> float:
+        return float(np.percentile([rotation_residual(p, xy, size, f) for p in pairs], 90))
+
+    if focal:
+        return unexplained(focal)
+    coarse = _COARSE_FOCALS * max(size)
+    best = coarse[int(np.argmin([unexplained(f) for f in coarse]))]
+    return min(unexplained(best * factor) for factor in _FINE_FACTORS)
+
+
+def rotation_residual(
+    pair: VerifiedPair, xy: Sequence[NDArray[np.float64]], size: tuple[int, int], focal: float
+) -> float:
+    """Pixels within which four fifths of a pair's matches obey the best rotation about the camera's centre."""
+    centre = np.array(size) / 2
+    first = _turned_rays(xy[pair.first][pair.matches[:, 0]] - centre, focal)
+    second = _turned_rays(xy[pair.second][pair.matches[:, 1]] - centre, focal)
+    angle = np.linalg.norm(first @ best_rotation(first, second).T - second, axis=1)
+    return float(np.percentile(angle, 80) * focal)
+
+
+def _displacement(pair: VerifiedPair, xy: Sequence[NDArray[np.float64]]) -> float:
+    moved = xy[pair.first][pair.matches[:, 0]] - xy[pair.second][pair.matches[:, 1]]
+    return float(np.median(np.linalg.norm(moved, axis=1)))
+
+
+def _turned_rays(xy: NDArray[np.float64], focal: float) -> NDArray[np.float64]:
+    rays = np.concatenate([xy, np.full((len(xy), 1), focal)], axis=1)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
