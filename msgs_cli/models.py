@@ -72,7 +72,7 @@ def list_models() -> None:
 def pull(names: tuple[str, ...], best: bool, folder: Path | None, trust: bool, offline: bool, yes: bool) -> None:
     """Download models by name, with what they need; without a name the small ones (4 MB): classes, metres, people.
 
-    Interrupted downloads resume.
+    A file takes its place when it is whole, by its sha256.
     """
     from ..formats.errors import InputError
     from ..pipelines.networks.registry import ModelStore

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from msgs_slam.formats.errors import DiskFullError, InputError
-from msgs_slam.formats.reading import file_sha256
 from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.networks.download import fetch
 from msgs_slam.pipelines.networks.registry import Model, ModelStore
@@ -75,31 +74,13 @@ def silent(done: int, size: int) -> None:
     assert 0 < done <= size
 
 
-def test_a_line_cut_twice_is_continued_where_it_broke(server: tuple[str, Behaviour], tmp_path: Path) -> None:
+@pytest.mark.parametrize("size", [len(DATA), 0])
+def test_a_broken_line_is_tried_again(server: tuple[str, Behaviour], tmp_path: Path, size: int) -> None:
     url, behaviour = server
     behaviour.cuts = [300_000, 200_000]
-    assert fetch([f"{url}/m"], tmp_path / "m.onnx", len(DATA), SHA, silent) == SHA
+    assert fetch([f"{url}/m"], tmp_path / "m.onnx", size, SHA if size else "", silent) == SHA
     assert (tmp_path / "m.onnx").read_bytes() == DATA
-    assert [r for _, r in behaviour.requests] == ["", "bytes=300000-", "bytes=500000-"]
     assert [p.name for p in tmp_path.iterdir()] == ["m.onnx"]
-
-
-def test_a_later_call_goes_on_and_a_changed_file_begins_again(server: tuple[str, Behaviour], tmp_path: Path) -> None:
-    url, behaviour = server
-    behaviour.cuts = [300_000, 0]
-    with pytest.raises(InputError, match="could not be downloaded"):
-        fetch([f"{url}/m"], tmp_path / "m.onnx", len(DATA), SHA, silent)
-    assert (tmp_path / "m.onnx.part").stat().st_size == 300_000
-    behaviour.etag, behaviour.data = '"two"', DATA[::-1]
-    fetch([f"{url}/m"], tmp_path / "m.onnx", len(DATA), hashlib.sha256(DATA[::-1]).hexdigest(), silent)
-    assert (tmp_path / "m.onnx").read_bytes() == DATA[::-1]
-
-
-def test_without_ranges_it_begins_again(server: tuple[str, Behaviour], tmp_path: Path) -> None:
-    url, behaviour = server
-    behaviour.ranges, behaviour.cuts = False, [100_000, 400_000]
-    fetch([f"{url}/m"], tmp_path / "m.onnx", len(DATA), SHA, silent)
-    assert (tmp_path / "m.onnx").read_bytes() == DATA
 
 
 def test_404_and_a_wrong_hash_go_to_the_next_mirror(
@@ -110,7 +91,7 @@ def test_404_and_a_wrong_hash_go_to_the_next_mirror(
     fetch([f"{url}/gone", f"{url}/m"], tmp_path / "m.onnx", len(DATA), SHA, silent)
     assert [p for p, _ in behaviour.requests] == ["/gone", "/m"]
     assert [r.getMessage().count("404 Not Found") for r in caplog.records] == [1]
-    with pytest.raises(InputError, match=r"sha256 is .* expected 0000"):
+    with pytest.raises(InputError, match=r"does not match"):
         fetch([f"{url}/m"], tmp_path / "n.onnx", len(DATA), "0" * 64, silent)
     assert not list(tmp_path.glob("n.onnx*"))
     caplog.clear()
@@ -122,23 +103,19 @@ def test_404_and_a_wrong_hash_go_to_the_next_mirror(
     assert not caplog.records, "the error names the address"
 
 
-def test_another_size_is_refused_before_it_is_written(server: tuple[str, Behaviour], tmp_path: Path) -> None:
+def test_another_size_is_refused_(server: tuple[str, Behaviour], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="700000 bytes, expected 5"):
         fetch([f"{server[0]}/m"], tmp_path / "m.onnx", 5, SHA, silent)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_full_disk_keeps_what_came(
-    server: tuple[str, Behaviour], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_leaves_nothing(server: tuple[str, Behaviour], tmp_path: Path) -> None:
     def full(done: int, size: int) -> None:
         raise OSError(28, "No space left on device")
 
     with pytest.raises(DiskFullError, match="disk is full"):
         fetch([f"{server[0]}/m"], tmp_path / "m.onnx", len(DATA), SHA, full)
-    assert 0 < (tmp_path / "m.onnx.part").stat().st_size <= len(DATA)
-    fetch([f"{server[0]}/m"], tmp_path / "m.onnx", len(DATA), SHA, silent)
-    assert file_sha256(tmp_path / "m.onnx") == SHA
+    assert not list(tmp_path.iterdir())
 
 
 def test_only_https_is_downloaded_from(tmp_path: Path) -> None:
@@ -188,7 +165,7 @@ def test_a_replaced_file_is_refused_and_said_to_be_replaced(server: tuple[str, B
     with pytest.raises(InputError, match="have replaced the file"):
         models.pull(models.get("net"), silent)
     pinned = replace(models.get("net"), revision="8b1f705a")
-    with pytest.raises(InputError, match="expected 0000") as raised:
+    with pytest.raises(InputError, match="expected sha256:0000") as raised:
         models.pull(pinned, silent)
     assert "replaced" not in str(raised.value)
 
@@ -237,13 +214,6 @@ def test_own_files_are_added_checked_and_used_first(shared_data: Path, tmp_path:
     again = ModelStore.open(tmp_path)
     assert again.first_here("depth") == again.get("toy") == added
     assert again.verify()["toy"] == "ok"
-
-
-def test_a_file_of_unknown_size_is_continued_too(server: tuple[str, Behaviour], tmp_path: Path) -> None:
-    url, behaviour = server
-    behaviour.cuts = [300_000]
-    assert fetch([f"{url}/m"], tmp_path / "head.pth", 0, "", silent) == SHA
-    assert [r for _, r in behaviour.requests] == ["", "bytes=300000-"]
 
 
 def test_the_small_depth_network_comes_before_the_large_one_but_for_best(
