@@ -81,7 +81,7 @@ def _busy(run: RunFolder, held: Path, more: str = "") -> RunBusyError:
     with suppress(OSError):
         holder = " ".join(held.read_text(encoding="utf-8", errors="replace").split())
     return RunBusyError(
-        f"{run.root}: another msgs-slam process is working on this run. Wait for it to end "
+        f"{run.root}: another msgs-slam process is working on this run. Wait for it to end"
         f" (it is {holder or 'unknown'}){more}"
     )
 
