@@ -139,7 +139,7 @@ def _viewer() -> Finding:
 
 
 def _threads() -> Finding:
-    from ..pipelines.system.memory import available_cpus
+    from ..pipelines.system.machine import available_cpus
 
     cores = available_cpus()
     limit = os.environ.get("OMP_NUM_THREADS", "")
@@ -152,7 +152,7 @@ def _threads() -> Finding:
 
 
 def _memory() -> Finding:
-    from ..pipelines.system.memory import machine_memory
+    from ..pipelines.system.machine import machine_memory
 
     size = machine_memory() / 1e9
     if size < _MIN_MEMORY:
@@ -164,7 +164,7 @@ def _memory() -> Finding:
 def _gpu() -> Finding:
     import torch
 
-    from ..pipelines.system.device import unused_card
+    from ..pipelines.system.machine import unused_card
 
     if torch.cuda.is_available():
         properties = torch.cuda.get_device_properties(0)

@@ -134,7 +134,7 @@ def use_threads(run: RunFolder | None = None) -> None:
     container's share, not its machine's."""
     from ..pipelines.engine.tasks import limit_threads
     from ..pipelines.run.folder import load_settings
-    from ..pipelines.system.memory import available_cpus
+    from ..pipelines.system.machine import available_cpus
 
     limit_threads((load_settings(run).run.threads if run is not None else 0) or available_cpus())
 

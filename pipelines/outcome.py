@@ -36,7 +36,7 @@ from .run.files import (
 )
 from .run.folder import RunFolder, load_records, load_settings, load_source, why_not_done
 from .run.manifest import StageRecord, keyframe_psnr, piece_digest, recorded_config
-from .system.device import resolve_device
+from .system.machine import resolve_device
 from .types import VOID, Calibration, ClassTable, Frame, Metres, Trajectory
 
 T = TypeVar("T")

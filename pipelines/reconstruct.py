@@ -22,8 +22,7 @@ from .run.manifest import StageRecord, recorded_config
 from .run.progress import ProgressFile
 from .source.recording import open_recording
 from .source.videos import require_different
-from .system.device import require_device
-from .system.memory import available_cpus
+from .system.machine import available_cpus, require_device
 from .system.progress import Progress, log
 from .system.wording import quoted
 

@@ -187,7 +187,7 @@ def test_nothing_is_unpickled() -> None:
 
 UNSAFE_IMPORTS = {"subprocess", "pty", "marshal", "shelve", "dill", "cloudpickle", "joblib", "yaml", "ctypes"}
 UNSAFE_BUT_HERE = {
-    "pipelines/system/memory.py": {"ctypes"},
+    "pipelines/system/machine.py": {"ctypes"},
     "pipelines/evaluation/html.py": {"subprocess"},
     "formats/video_streams.py": {"subprocess"},
     "formats/datasets/calibration.py": {"yaml"},
@@ -251,7 +251,7 @@ def test_files_stay_readable(path: Path) -> None:
     for node in ast.walk(ast.parse("\n".join(lines))):
         if isinstance(node, ast.FunctionDef):
             # A compiled kernel is one nest of loops: what it calls would have to be compiled and inlined with it.
-            most = 110 if any(ast.unparse(d) == "kernel" for d in node.decorator_list) else 60
+            most = 110 if any(ast.unparse(d).endswith("kernel") for d in node.decorator_list) else 60
             length = (node.end_lineno or 0) - node.lineno
             assert length <= most, f"{node.name} is {length} lines"
 

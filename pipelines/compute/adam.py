@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from . import gpu
-from .threads import for_each, kernel
+from .threads import for_each, fused_kernel
 
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
 _ROWS = 8192
@@ -187,7 +187,7 @@ def _descend_fast(
     for_each(work, -(-count // _ROWS))
 
 
-@kernel
+@fused_kernel
 def _descend_rows(
     value: NDArray, first: NDArray, second: NDArray, gradient: NDArray, rows: NDArray, shares: NDArray, start: int,
     end: int, width: int, stride: int, scale: float, root: float,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..system import jit
-from ..system.memory import available_cpus
+from ..system.machine import available_cpus
 from . import gpu
 
 # No "nnan" or "ninf": comparisons with a NaN must stay what they are. "contract" lets a*b+c become one instruction.
@@ -82,7 +82,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_pools)
 
 
-def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+def fused_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile as `pipelines.system.jit.kernel` does, with fused sums."""
     compiled: Callable[..., Any] = jit.kernel(function, **_OPTIONS)
     return compiled

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..geometry.posed_depth import PosedDepth, neighbours
 from ..geometry.sparse_model import SparseModel
 from ..providers import DepthEstimate
-from ..system.memory import ALIGNED_TOGETHER
+from ..system.machine import ALIGNED_TOGETHER
 from ..system.parallel import LruSequence
 from ..types import Intrinsics, ProxyMaps
 from .fields import FINE, Basis, DepthFields, Equations, Grid, Prior, solve_fields

@@ -18,7 +18,7 @@ from ..run.ending import FINGERPRINT, empty, find_sealed, move_in, results, seal
 from ..run.folder import RunFolder, load_records, load_stale, save_settings
 from ..run.manifest import Manifest, Source, StageRecord, content_digest, finite_or_none, settings_of, write_manifest
 from ..run.progress import TimeLeft
-from ..system.memory import release_free_memory
+from ..system.machine import release_free_memory
 from ..system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log, stop_if_asked
 from ..system.wording import quoted
 from .stages import SameSource, Stage, StageContext, TaskWorkers, stopping_after_writes, trust_source

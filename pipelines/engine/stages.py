@@ -13,8 +13,7 @@ from ...formats.atomic import after_each_write
 from ..config import Config
 from ..run.ending import SNAPSHOT
 from ..run.folder import RunFolder
-from ..system.device import resolve_device
-from ..system.memory import available_cpus, memory_room, release_free_memory
+from ..system.machine import available_cpus, memory_room, release_free_memory, resolve_device
 from ..system.progress import Progress, log, stop_if_asked
 
 T = TypeVar("T")

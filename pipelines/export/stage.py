@@ -23,7 +23,7 @@ from ..scene.metres import find_metres
 from ..scene.upright import find_upright
 from ..scene.world import FIRST, WORLD, World, upright_world, world_figures
 from ..source.recording import is_of_source
-from ..system.memory import release_free_memory
+from ..system.machine import release_free_memory
 from ..system.progress import Progress, SilentProgress, log
 from ..types import Metres
 from .extra.floor_plan import write_floor_plan

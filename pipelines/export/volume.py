@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.sog import morton_codes
-from ..compute.threads import for_each, get_threads, kernel
+from ..compute.threads import for_each, fused_kernel, get_threads
 from ..geometry.camera import unproject_depth
 from ..geometry.posed_depth import PosedDepth
 from ..geometry.voxels import cells_of, voxel_keys
@@ -158,7 +158,7 @@ def fuse(grid: Grid, chunks: NDArray[np.int32], views: Iterable[PosedDepth]) -> 
     return Volume(voxel, blocks, distance, weight)
 
 
-@kernel
+@fused_kernel
 def _integrate(rows, blocks, distance, weight, depth, depth_weight, pose, camera, voxel, truncation):  # type: ignore[no-untyped-def]
     height, width = depth.shape
     fx, fy, cx, cy = camera

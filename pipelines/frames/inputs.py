@@ -14,7 +14,7 @@ from ..run.folder import RunFolder, load_records
 from ..source.given import check_poses, intrinsics_inputs, pose_inputs, read_intrinsics
 from ..source.recording import FolderRecording, Recording, open_recording
 from ..source.videos import Warn
-from ..system.memory import window_size, windows_of
+from ..system.machine import window_size, windows_of
 from .learned import learned_inputs, open_learned
 from .masks import check_masks, mask_inputs
 

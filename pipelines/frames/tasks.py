@@ -23,7 +23,7 @@ from ..source.faces import Faces, find_faces
 from ..source.given import given_poses, read_intrinsics
 from ..source.recording import Recording, open_recording
 from ..source.sharpness import reduced_size
-from ..system.memory import window_size
+from ..system.machine import window_size
 from ..system.progress import Progress
 from ..types import Features, Frame, GivenPoses
 from .learned import open_learned, picture_features

@@ -28,7 +28,7 @@ from ..geometry.voxels import (
 )
 from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, Sequence, class_colors
 from ..system.jit import kernel
-from ..system.memory import release_free_memory
+from ..system.machine import release_free_memory
 from ..system.progress import Progress
 from ..types import VOID, ClassTable, Frame
 

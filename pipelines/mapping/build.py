@@ -15,7 +15,7 @@ from ..render.gaussian_map import GaussianMap
 from ..run.extension import ParentRun
 from ..run.files import CALIBRATION, CLASS_IDS, DEPTH_FIELDS, EXPOSURE, SUBMAPS
 from ..run.folder import RunFolder
-from ..system.memory import submap_size
+from ..system.machine import submap_size
 from ..types import Trajectory
 from .division import split_frames, submap_count
 from .extending import GROWN, grow_submap

@@ -6,7 +6,7 @@ from ..config import Config
 from ..run.extension import parent_inputs
 from ..run.files import CALIBRATION, TRAJECTORY
 from ..run.folder import RunFolder
-from ..system.memory import submap_size
+from ..system.machine import submap_size
 from ..types import Trajectory
 
 

@@ -15,7 +15,7 @@ from ..engine.stages import StageContext
 from ..geometry.posed_depth import PosedDepth
 from ..run.files import CALIBRATION, DEPTH_FIELDS, FRAMES
 from ..run.folder import RunFolder
-from ..system.memory import VIEWS_SHARE, room_on
+from ..system.machine import VIEWS_SHARE, room_on
 from ..system.parallel import LruSequence
 from ..types import Frame, Intrinsics, ProxyMaps, Trajectory
 from .division import split_frames

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..compute.lanes import iota, load, splat, store, total, where
 from ..compute.ssim import C1, C2, blur_array, ssim_map
-from ..compute.threads import for_each, inner, kernel
+from ..compute.threads import for_each, fused_kernel, inner
 from .exposure import expose
 
 SSIM_WEIGHT = 0.2
@@ -130,7 +130,7 @@ class _PhotoLoss(torch.autograd.Function):
         return ctx.saved_tensors[0] * grads[0], None, None, None
 
 
-@kernel
+@fused_kernel
 def _expose(
     shown: NDArray[np.float32],
     photo: NDArray[np.uint8],
@@ -158,7 +158,7 @@ def _expose(
         sums[0] += row
 
 
-@kernel
+@fused_kernel
 def _similarity(
     band: int, length: int, count: int, moments: NDArray[np.float32], planes: NDArray[np.float32],
     sums: NDArray[np.float64],
@@ -186,7 +186,7 @@ def _similarity(
         sums[1] += total(where(iota(np.float32(i - count)) < splat(_ZERO), value))
 
 
-@kernel
+@fused_kernel
 def _differentiate(
     shown: NDArray[np.float32],
     photo: NDArray[np.uint8],

@@ -24,8 +24,7 @@ from ..render.gaussian_map import GaussianMap
 from ..render.inspection import blending_weights, median_depth
 from ..run.extension import ParentRun
 from ..run.folder import RunFolder
-from ..system.device import resolve_device
-from ..system.memory import memory_room
+from ..system.machine import memory_room, resolve_device
 from ..system.progress import Progress
 from ..types import Intrinsics, Trajectory
 from .exposure import SeenExposures, common_exposure

@@ -42,7 +42,7 @@ from ..run.files import (
     SPARSE,
     TRAJECTORY,
 )
-from ..system.memory import VIEWS_SHARE
+from ..system.machine import VIEWS_SHARE
 from ..system.parallel import LruSequence
 from ..system.progress import is_asked
 from ..system.wording import stretches

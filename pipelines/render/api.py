@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..compute import gpu
-from ..compute.threads import PART, for_each, kernel
+from ..compute.threads import PART, for_each, fused_kernel
 from ..geometry import se3
 from ..geometry.camera import project_gaussians
 from ..types import Intrinsics
@@ -253,7 +253,7 @@ def marked_in_view(
     return mark_in_view(means, radii, cam_from_world.to(means), intrinsics, near)
 
 
-@kernel
+@fused_kernel
 def _list_in_view(
     means: NDArray[np.float32], radii: NDArray[np.float32], pose: NDArray[np.float32], camera: NDArray[np.float32],
     start: int,

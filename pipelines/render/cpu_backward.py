@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..compute.lanes import add_totals, load, maximum, reciprocal, reduce_max, splat, store, total, where
-from ..compute.threads import PART, for_each, inlined, inner, kernel
+from ..compute.threads import PART, for_each, fused_kernel, inlined, inner
 from . import reference
 from .cpu_bands import PIXELS, RECORD, TILE, Bands, clear, for_each_band, row_opacity, walk_tiles
 from .cpu_forward import Vectors, vectors_for
@@ -174,7 +174,7 @@ def close_gradients(job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.fl
     """Nothing is left to do in a tile: all is with the Gaussians."""
 
 
-@kernel
+@fused_kernel
 def backward_band(
     vectors: Vectors,
     band: int,
@@ -236,7 +236,7 @@ def backward_band(
                 noted[i, j] = notes[k, j]
 
 
-@kernel
+@fused_kernel
 def sum_shared(
     start: int,
     rows: int,

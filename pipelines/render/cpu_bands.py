@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..compute.lanes import any_of, exp, iota, load, maximum, min_scalar, splat, store, where
-from ..compute.threads import PART, for_each, inner, kernel
+from ..compute.threads import PART, for_each, fused_kernel, inner
 from . import reference
 
 F32 = np.float32
@@ -129,7 +129,7 @@ def bin_gaussians(
     return reach, first, starts, entries, slots
 
 
-@kernel
+@fused_kernel
 def find_bands(
     u: NDArray[np.float32],
     v: NDArray[np.float32],
@@ -168,7 +168,7 @@ def find_bands(
             counts[band] += counts[band - 1]
 
 
-@kernel
+@fused_kernel
 def list_bands(
     start: int, first: NDArray[np.int32], last: NDArray[np.int32], places: NDArray[np.int64], entries: NDArray[np.int32]
 ) -> None:
@@ -191,7 +191,7 @@ def near_to_far(entries: NDArray[np.int32], z: NDArray[np.float32]) -> NDArray[n
     return keys.astype(np.uint32).view(np.int32)
 
 
-@kernel
+@fused_kernel
 def gather_band(
     entries: NDArray[np.int32],
     u: NDArray[np.float32],
@@ -215,7 +215,7 @@ def gather_band(
     return records, padded
 
 
-@kernel
+@fused_kernel
 def list_tiles(
     records: NDArray[np.float32], top: int, width: int, rows: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..compute.lanes import add_to_box, load, store
-from ..compute.threads import inlined, inner, kernel
+from ..compute.threads import fused_kernel, inlined, inner
 from .cpu_bands import PIXELS, TILE, Bands, clear, for_each_band, row_opacity, walk_tiles
 
 F32 = np.float32
@@ -111,7 +111,7 @@ def close_drawing(job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.floa
             out_planes[2, top + y, left + x] = seen
 
 
-@kernel
+@fused_kernel
 def forward_band(
     vectors: Vectors,
     channels: int,

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..compute.lanes import load, maximum, reduce_max, splat, store, total, where
-from ..compute.threads import inlined, inner, kernel
+from ..compute.threads import fused_kernel, inlined, inner
 from .cpu_bands import PIXELS, TILE, Bands, clear, for_each_band, split_into_bands, walk_tiles
 from .cpu_forward import DEPTH_SUM, WEIGHTS, blend_rows, paint_rows
 
@@ -140,7 +140,7 @@ def close_counts(job: tuple[Any, ...], kind: None, light: NDArray[np.float32], t
             median[top + y, left + x] = state[MEDIAN + TILE * y + x]
 
 
-@kernel
+@fused_kernel
 def inspect_band(
     band: int,
     own: NDArray[np.int32],
@@ -214,7 +214,7 @@ def close_look(job: tuple[Any, ...], classes: int, light: NDArray[np.float32], t
             planes[4, top + y, left + x] = best
 
 
-@kernel
+@fused_kernel
 def look_band(
     classes: int,
     band: int,

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..compute.threads import PART, as_array, for_each, inner, kernel
+from ..compute.threads import PART, as_array, for_each, fused_kernel, inner
 from ..types import Intrinsics
 
 
@@ -53,7 +53,7 @@ def _in_camera(pose: NDArray[np.float32], center: NDArray[np.float32]) -> tuple[
     return x, y, z
 
 
-@kernel
+@fused_kernel
 def _project(
     start: int,
     means: NDArray[np.float32],
@@ -74,7 +74,7 @@ def _project(
         out[3, i] = z
 
 
-@kernel
+@fused_kernel
 def _pull_back(
     start: int,
     means: NDArray[np.float32],

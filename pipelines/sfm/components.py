@@ -17,7 +17,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ..geometry import se3
-from ..system.memory import windows_of
+from ..system.machine import windows_of
 from ..types import Array, Intrinsics
 from .adjust import FEATURE_SD
 from .bundle import Bundle, Problem

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ...formats.textfile import read_json, write_json
-from ..system.memory import WINDOW, release_free_memory, windows_of
+from ..system.machine import WINDOW, release_free_memory, windows_of
 from ..system.parallel import LruSequence, parallel_map
 from ..system.progress import log
 from ..types import Features, Vocabulary

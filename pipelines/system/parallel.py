@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from threading import Lock
 from typing import Generic, TypeVar, overload
 
-from .memory import release_free_memory
+from .machine import release_free_memory
 
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")

@@ -21,7 +21,7 @@ from ..run.files import (
 )
 from ..sfm.adjust import FEATURE_SD
 from ..sfm.rolling import Shutter
-from ..system.memory import release_free_memory
+from ..system.machine import release_free_memory
 from ..system.progress import is_asked
 from ..system.values import load_value, save_value
 from ..system.wording import stretches

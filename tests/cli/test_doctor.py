@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from msgs_slam.formats.errors import install_command, install_extra
 from msgs_slam.msgs_cli.doctor import BAD, GOOD, NOTE, Finding, examine
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.pipelines.system import device, memory
+from msgs_slam.pipelines.system import machine
 
 
 def found(name: str, folder: Path) -> Finding:
@@ -36,7 +36,7 @@ def test_what_is_missing_is_said_with_its_fix(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setenv("MSGS_SLAM_CACHE", str(tmp_path / "none"))
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setattr("msgs_slam.msgs_cli.doctor._MODULES", ("math", "no_such_module_at_all"))
-    monkeypatch.setattr("msgs_slam.pipelines.system.memory.available_cpus", lambda: 3)
+    monkeypatch.setattr("msgs_slam.pipelines.system.machine.available_cpus", lambda: 3)
     usage = namedtuple("usage", "free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10**8))
     findings = {f.name: f for f in examine(tmp_path)}
@@ -49,7 +49,7 @@ def test_what_is_missing_is_said_with_its_fix(tmp_path: Path, monkeypatch: pytes
 
 
 def test_memory_is_that_of_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "memory_limits", lambda: [2e9])
+    monkeypatch.setattr(machine, "memory_limits", lambda: [2e9])
     assert found("memory", tmp_path).state == NOTE
     assert found("memory", tmp_path).text.startswith("2.0 GB")
 
@@ -85,15 +85,15 @@ def test_a_check_that_breaks_is_a_finding(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_card_that_torch_cannot_use_is_a_note(
     built: str | None, fix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(device.shutil, "which", lambda name: f"/usr/bin/{name}")
+    monkeypatch.setattr(machine.shutil, "which", lambda name: f"/usr/bin/{name}")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.version, "cuda", built)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     seen = found("gpu", tmp_path)
     assert (seen.state, fix in seen.fix) == (NOTE, True)
-    device._told.cache_clear()
-    assert device.resolve_device("auto") == "cpu"
+    machine._log_once.cache_clear()
+    assert machine.resolve_device("auto") == "cpu"
     assert fix in caplog.text
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     assert found("gpu", tmp_path).state == GOOD
-    device._told.cache_clear()
+    machine._log_once.cache_clear()

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...compute.lanes import any_of, exp, iota, load, maximum, min_scalar, splat, store, where
-from ...compute.threads import inner, kernel
+from ...compute.threads import fused_kernel, inner
 from .lane_sampling import choose, corners, smallest
 from .volume import Bands
 
@@ -59,7 +59,7 @@ def _sample(depth: NDArray[np.float32], width: int, height: int, px: Any, py: An
     return choose(whole, splat(_ONE) / (above + fy * (below - above)), nearest)
 
 
-@kernel
+@fused_kernel
 def _fuse_band(
     depth: NDArray[np.float32],
     others: NDArray[np.float32],

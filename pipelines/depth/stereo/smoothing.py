@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...compute.lanes import load, splat, store
-from ...compute.threads import inner, kernel
+from ...compute.threads import fused_kernel, inner
 from .lane_sampling import smallest, smallest_of
 from .volume import BLOCK, TILE, UNREACHED, Bands, Volume, pixel_of_tile
 
@@ -47,7 +47,7 @@ def path_starts(height: int, width: int, dy: int, dx: int) -> NDArray[np.int64]:
     return np.argwhere(first)
 
 
-@kernel
+@fused_kernel
 def _scan_paths(
     cost: NDArray[np.float32],
     places: NDArray[np.int64],

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...compute.lanes import splat, store
-from ...compute.threads import inner, kernel
+from ...compute.threads import fused_kernel, inner
 from .lane_sampling import with_row_below
 from .volume import BLOCK, TILE, UNREACHED, Bands, Volume, pixel_of_tile, tiles_of
 from .window import (
@@ -83,7 +83,7 @@ def sweep_cost(
     return cost
 
 
-@kernel
+@fused_kernel
 def _sweep_band(
     image: NDArray[np.float32],
     others: NDArray[np.float32],
@@ -179,7 +179,7 @@ def refine_inverse_depth(
     return refined
 
 
-@kernel
+@fused_kernel
 def _refine_band(
     image: NDArray[np.float32],
     others: NDArray[np.float32],

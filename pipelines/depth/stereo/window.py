@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...compute.lanes import exp, iota, load, maximum, min_scalar, splat, store, where
-from ...compute.threads import inner, kernel
+from ...compute.threads import fused_kernel, inner
 from .lane_sampling import choose, interpolate, smallest, square_root
 from .volume import BAND_ROWS
 
@@ -204,7 +204,7 @@ def best_mean(
     return total / maximum(used, splat(_ONE))
 
 
-@kernel
+@fused_kernel
 def surface_contrast(image: NDArray[np.float32]) -> NDArray[np.float32]:
     """(h, w) variance of the intensities (0..1) of each pixel's window, which count by how like the pixel they are: of
     a blank surface it is small also beside its border."""

@@ -24,7 +24,7 @@ from msgs_slam.pipelines.run.schema import dataclass_from_json
 from msgs_slam.pipelines.sfm import driver as sfm
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
 from msgs_slam.pipelines.source.recording import open_recording
-from msgs_slam.pipelines.system.memory import windows_of
+from msgs_slam.pipelines.system.machine import windows_of
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration
 from tests.killed import KillAt, Killed

@@ -15,7 +15,7 @@ from msgs_slam.pipelines.sfm.driver import StructureFromMotion
 from msgs_slam.pipelines.sfm.joining import WindowModels, found_readout
 from msgs_slam.pipelines.sfm.rolling import NO_READOUT, Readout
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
-from msgs_slam.pipelines.system.memory import windows_of
+from msgs_slam.pipelines.system.machine import windows_of
 from msgs_slam.pipelines.system.parallel import LruSequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.pipelines.frames.test_frames_rolling import COUNT, READOUT, TIMES, as_model, off_by, poses_of, seen_by

@@ -31,7 +31,7 @@ from msgs_slam.pipelines.sfm.joining import (
 from msgs_slam.pipelines.sfm.lens import unknown_camera
 from msgs_slam.pipelines.sfm.matching import VerifiedPair
 from msgs_slam.pipelines.sfm.rolling import NO_READOUT
-from msgs_slam.pipelines.system.memory import WINDOW, WINDOW_OVERLAP, window_size, windows_of
+from msgs_slam.pipelines.system.machine import WINDOW, WINDOW_OVERLAP, window_size, windows_of
 from msgs_slam.pipelines.types import Calibration, Intrinsics
 from tests.world.paths import look_at
 

@@ -25,7 +25,7 @@ from msgs_slam.pipelines.mapping.load import load_views
 from msgs_slam.pipelines.run.files import CLASSES, EXPOSURE, MAP, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import WORLD
-from msgs_slam.pipelines.system.memory import room_on
+from msgs_slam.pipelines.system.machine import room_on
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID
 from tests.pipelines.mapping.small_run import make_run

@@ -27,7 +27,7 @@ from msgs_slam.pipelines.outcome import load_outcome, maps_around
 from msgs_slam.pipelines.run.files import DEPTH_FIELDS, MAP, SUBMAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.schema import RunFile
-from msgs_slam.pipelines.system.memory import MIN_SUBMAP, submap_size
+from msgs_slam.pipelines.system.machine import MIN_SUBMAP, submap_size
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Intrinsics
 from tests.killed import Killed

@@ -15,8 +15,8 @@ from msgs_slam.pipelines.compute.threads import get_threads
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system import memory as limits
-from msgs_slam.pipelines.system.memory import available_cpus, machine_memory, memory_room
+from msgs_slam.pipelines.system import machine as limits
+from msgs_slam.pipelines.system.machine import available_cpus, machine_memory, memory_room
 from msgs_slam.pipelines.system.parallel import LruSequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 
