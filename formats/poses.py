@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from .colmap import read_colmap_model
 from .colmap_files import find_models
 from .errors import InputError
-from .reading import home_expanded, parsing, reaching
+from .reading import home_expanded, note_read, parsing, reaching
 from .textfile import read_json, read_json_object, read_xml
 from .trajectory import OPENCV_FROM_OPENGL, clean_poses, poses_from_quaternions, read_trajectory
 
@@ -208,8 +208,10 @@ def phone_poses(path: Path) -> Found | None:
         return _record3d(path)
     for name in _POLYCAM:
         if files := sorted((path / name).glob("[!.]*.json")):
+            note_read(path / name)
             return "Polycam's poses", [f.stem for f in files], np.stack([_polycam(f) for f in files])
     if files := sorted(path.glob("frame_*.json")):
+        note_read(path)
         return "3D Scanner App's poses", [f.stem for f in files], _scanner_app(files)
     if (path / "odometry.csv").is_file():
         found = _from_text(path / "odometry.csv")

@@ -35,19 +35,36 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 Listed = dict[Path, dict[str, list[str]]]
 """What is in folders, by its `folded` names."""
-_noted: ContextVar[list[Path] | None] = ContextVar("_noted", default=None)
+_noted: ContextVar[tuple[Callable[[Path], None], ...]] = ContextVar("_noted", default=())
+
+
+@contextmanager
+def on_each_read(call: Callable[[Path], None]) -> Iterator[None]:
+    """Call a function with the path of each file that this thread opens, by `opened` and what is built on it, in the
+    block: what an identity of the result has to cover."""
+    token = _noted.set((*_noted.get(), call))
+    try:
+        yield
+    finally:
+        _noted.reset(token)
 
 
 @contextmanager
 def noting_files() -> Iterator[list[Path]]:
-    """Yield a list that gets the path of each file that this thread opens, by `opened` and what is built on it, in the
-    block: what an identity of the result has to cover."""
+    """Yield a list that gets the path of each file that is opened in the block, as for `on_each_read`; nobody else is
+    told of them."""
     files: list[Path] = []
-    token = _noted.set(files)
+    token = _noted.set((files.append,))
     try:
         yield files
     finally:
         _noted.reset(token)
+
+
+def note_read(path: Path) -> None:
+    """Tell `on_each_read` of a file that a library opens itself, or of a folder whose names are read."""
+    for call in _noted.get():
+        call(path)
 
 
 @contextmanager
@@ -109,8 +126,7 @@ def opened(path: Path, limit: int | None = None, *, any_content: bool = False) -
             raise InputError(f"{str(path)!r} is no path: check the spelling") from error
         except IsADirectoryError:
             raise InputError(f"{path} is a folder, not a file") from None
-    if (noted := _noted.get()) is not None:
-        noted.append(path)
+    note_read(path)
     with file:
         with reaching(path):
             _require_kind(path, file, limit)

@@ -36,6 +36,7 @@ from .run.files import (
 )
 from .run.folder import RunFolder, load_records, load_settings, load_source, why_not_done
 from .run.manifest import StageRecord, keyframe_psnr, piece_digest, recorded_config
+from .run.reads import note_figures, watched
 from .system.machine import resolve_device
 from .types import VOID, Calibration, ClassTable, Frame, Metres, Trajectory
 
@@ -166,7 +167,8 @@ class Outcome:
 def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
     """Load the results of a run, its map on `device`. Raises InputError for a run whose tracking is not done."""
     records = load_records(run)
-    config = recorded_config(records, load_settings(run))
+    config = watched(recorded_config(records, load_settings(run)))
+    note_figures(run.root, records)
     pose_stage = next((s for s in _POSE_STAGES if s in records), "")
     if not pose_stage:
         raise InputError(f"{run.root}: no camera poses yet ({why_not_done(run, 'tracking')})")

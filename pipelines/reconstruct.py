@@ -5,16 +5,15 @@ from pathlib import Path
 
 from ..formats.atomic import temporary_of, unique_temp_names, write_text
 from ..formats.errors import InputError, RecoverableError
+from ..formats.gps import read_track
 from ..formats.reading import require_listable, require_unicode
 from ..formats.video import probe_video
-from .config import SOURCE_LIST, STAGES, Config, overridden, with_method, without_method
+from .config import GPS_AUTO, GPS_OFF, SOURCE_LIST, STAGES, Config, overridden, with_method, without_method
 from .engine.runner import run_stages
 from .engine.stages import Later, Stage, TaskWorkers
-from .export.inputs import check_export, export_inputs
-from .frames.inputs import check_frames, frames_division, frames_inputs
-from .mapping.division import mapping_division, mapping_inputs
-from .paper.constants import final_inputs, paper_inputs
-from .proxy.inputs import check_proxy, left_to_auto, proxy_inputs
+from .frames.inputs import check_frames, frames_division
+from .mapping.division import mapping_division
+from .proxy.inputs import check_proxy
 from .read_config import with_absolute_paths
 from .run.folder import RunFolder, load_records, load_settings, load_source
 from .run.lock import LOCK, SOFT_LOCK, locked, make_folder
@@ -30,28 +29,25 @@ from .system.wording import quoted
 def all_stages(method: str = "default") -> list[Stage]:
     """The stages of a method (`run.method`) in order. Nothing that computes is imported before a stage runs."""
     between = [
-        Stage("tracking", Later("tracking.stage"), lambda _, config: {"least_piece": config.frames.least_piece}),
-        Stage("mapping", Later("mapping.stage"), inputs=mapping_inputs, division=mapping_division),
+        Stage("tracking", Later("tracking.stage")),
+        Stage("mapping", Later("mapping.stage"), division=mapping_division),
         Stage("global_ba", Later("global_ba.stage")),
     ]
     if method == "paper":
-        between = [
-            Stage("tracking", Later("paper.stages", "track"), paper_inputs),
-            Stage("mapping", Later("paper.stages", "map_keyframes"), paper_inputs),
-            Stage("global_ba", Later("paper.stages", "close_and_adjust"), final_inputs),
-        ]
+        names = {"tracking": "track", "mapping": "map_keyframes", "global_ba": "close_and_adjust"}
+        between = [Stage(stage, Later("paper.stages", name)) for stage, name in names.items()]
     return [
-        Stage(
-            "frames", Later("frames.stage"), frames_inputs, check_frames,
-            auto=lambda config: ("people",) if config.frames.people != "keep" else (), division=frames_division,
-        ),
-        Stage("proxy", Later("proxy.stage"), proxy_inputs, check_proxy, left_to_auto),
+        Stage("frames", Later("frames.stage"), check_frames, frames_division),
+        Stage("proxy", Later("proxy.stage"), check_proxy),
         *between,
-        Stage(
-            "export", Later("export.stage"), export_inputs, check_export,
-            auto=lambda config: ("metres",) if config.export.scale == "auto" else (),
-        ),
-    ]  # fmt: skip
+        Stage("export", Later("export.stage"), _check_export),
+    ]
+
+
+def _check_export(source: Path, config: Config) -> None:
+    """Raise InputError where the track that the user gives cannot be read."""
+    if config.export.gps not in (GPS_AUTO, GPS_OFF):
+        read_track(Path(config.export.gps))
 
 
 def default_run_folder(source: Path) -> RunFolder:

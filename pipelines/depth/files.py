@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...formats.errors import InputError
 from ...formats.image_folder import natural_key
 from ...formats.images import MAX_IMAGE_PIXELS, image_size, read_depth_png, read_grey_png
-from ...formats.reading import home_expanded, parsing, reaching, require_file
+from ...formats.reading import home_expanded, note_read, parsing, reaching, require_file
 from ...formats.tensors import HEADERS
 from ..geometry.camera import resample_nearest, resize_depth
 from ..providers import DepthEstimate, DepthProvider, Sequence
@@ -169,6 +169,7 @@ def _match_confidence(depth_folder: Path, sequence: Sequence, is_video: bool) ->
     alike = tuple(depth_folder.name.replace(_NAMES[0], n) for n in _CONFIDENCE_NAMES if _NAMES[0] in depth_folder.name)
     for name in alike + _CONFIDENCE_NAMES:
         folder = depth_folder.parent / name
+        note_read(folder)
         with reaching(folder):
             found = folder.is_dir() and any(p.suffix.lower() in suffixes for p in folder.iterdir())
         if found:
@@ -214,6 +215,7 @@ def match_files(
 
     Raises InputError when no frame finds a file.
     """
+    note_read(folder)
     files = _list(folder, suffixes, names)
     by_key = {frame_key(p.name): p for p in files}
     by_number = {n: p for p in reversed(files) if (n := _last_number(p.stem)) is not None}

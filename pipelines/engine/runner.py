@@ -8,27 +8,29 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from ...formats.atomic import is_disk_full, remove_temporaries, write_text
+from ...formats.atomic import is_disk_full, remove_temporaries
 from ...formats.errors import DiskFullError, InputError, RecoverableError
 from ...formats.reading import links_in
 from ..config import STAGES, Config
-from ..run.ending import FINGERPRINT, empty, find_sealed, move_in, results, seal, unseal
+from ..run.ending import empty, find_sealed, move_in, results, seal, unseal
 from ..run.folder import RunFolder, load_records, load_stale, save_settings
-from ..run.manifest import Manifest, Source, StageRecord, content_digest, finite_or_none, settings_of, write_manifest
+from ..run.manifest import (
+    Manifest,
+    Source,
+    StageRecord,
+    content_digest,
+    finite_or_none,
+    recorded_config,
+    settings_of,
+    write_manifest,
+)
 from ..run.progress import TimeLeft
+from ..run.reads import ReadLog, Situation, begin_log, reads_in, watched
 from ..system.machine import release_free_memory
 from ..system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log, stop_if_asked
 from ..system.wording import quoted
 from .stages import SameSource, Stage, StageContext, TaskWorkers, stopping_after_writes, trust_source
-from .staleness import (
-    effective_inputs,
-    memory_of,
-    next_upstream,
-    rerun_reason,
-    stage_fingerprint,
-)
 from .tasks import limit_threads
 
 _PROCESS = Path("/proc/self")
@@ -52,37 +54,35 @@ def run_stages(
     `config` is what was asked for, and is saved; the stages work with so many `threads` where it leaves that open. The
     stage `redo` and those after it are made again in any case, and `auto` chooses anew for them.
 
-    A stage is up to date when its fingerprint (code, own settings, seed, own inputs, content of the stages before
-    it) and its files are unchanged. Nothing of the run changes before everything that can be checked is; then the
-    settings are written, and the manifest calls a stage that has to run again stale, with those after it, before it
-    starts. Their folders stay until their own new results are ready; what still fits then counts again. Raises
-    InputError as the stages do.
+    A stage is up to date when its files are unchanged and all that it has read is (`run/reads.py`). Nothing of the run
+    changes before everything that can be checked is; then the settings are written, and the manifest calls a stage that
+    has to run again stale, with those after it, before it starts. Their folders stay until their own new results are
+    ready; what still fits then counts again. Raises InputError as the stages do.
     """
     run = RunFolder(run.root.absolute())  # tasks take it to processes with another working folder
-    upstream, book = source_digest, _Records(run, Source(str(source), source_digest))
+    book = _Records(run, Source(str(source), source_digest))
     records = book.current
     wanted = stages[: STAGES.index(until) + 1]
-    inputs = _check_inputs(wanted, run, source, config, source_digest, same_source, redo)
+    _check(wanted, run, source, config, source_digest, same_source, redo)
     if run.manifest() is None:
         book.save()
     save_settings(run, config)
     settled = replace(config, run=replace(config.run, threads=config.run.threads or threads))
     reporter = StageReporter(progress, wanted, records, settled.run.threads)
     for stage in wanted:
-        record = book.find(stage.name)
-        why = "" if record is None else rerun_reason(stage, run, record, config, upstream, inputs[stage.name])
+        record, now = book.find(stage.name), Situation(stage.program, source_digest, config, records)
+        why = "" if record is None else rerun_reason(stage, run, record, now)
         why = why or ("as asked for" if stage.name == redo else "")
         if record is None or why:
-            fingerprint = stage_fingerprint(stage, config, upstream, inputs[stage.name])
             if why and stage.name in records:
                 log.warning("%s and what follows are made again (%s)", stage.name, why)
             begun = stage.name not in records
             book.set_aside(stage.name, keep=stage.name != redo)
             folder = run.partial(stage.name)
-            context = StageContext(run, source, settled, folder, progress, [], stages, same_source, workers)
+            context = StageContext(run, source, watched(settled), folder, progress, [], stages, same_source, workers)
             with reporter.running(stage.name) as ended:
-                sealed = _find_ended(stage, run, config, fingerprint) if begun else None
-                record = sealed or _run_one(stage, context, fingerprint, inputs[stage.name], config)
+                sealed = _find_ended(stage, run, now) if begun else None
+                record = sealed or _run_one(stage, context, now)
                 move_in(run, stage.name)
                 ended(record)
             book.enter(stage.name, record)
@@ -92,8 +92,22 @@ def run_stages(
                 book.enter(stage.name, record)
             unseal(run, stage.name)
             reporter.report(stage.name, UP_TO_DATE)
-        upstream = next_upstream(upstream, record)
     return records
+
+
+def rerun_reason(stage: Stage, run: RunFolder, record: StageRecord, now: Situation) -> str:
+    """Why a finished stage has to be made again, "" where it has not."""
+    if not run.stage(stage.name).exists():
+        return "its folder is gone"
+    if why := record.reads.difference(now):
+        return why
+    if damaged := run.damaged(stage.name):  # last, for it reads all of them
+        return f"{len(damaged)} of its files are missing or damaged"
+    config, was = now.config, recorded_config({stage.name: record}, now.config)
+    memory = was.run.memory_mb
+    if stage.division and memory != config.run.memory_mb and stage.division(run, config) != stage.division(run, was):
+        return f"run.memory_mb={config.run.memory_mb} divides it otherwise than {memory} has"
+    return ""
 
 
 class _Records:
@@ -165,66 +179,55 @@ class StageReporter:
             raise
 
 
-def _check_inputs(
-    stages: list[Stage], run: RunFolder, source: Path, config: Config, upstream: str, same_source: SameSource, redo: str
-) -> dict[str, Any]:
-    """What each stage reads beside the stages before it; raises InputError where one has work to do and cannot.
-
-    A finished stage whose inputs are gone (files deleted, a model removed) stays as it is.
-    """
+def _check(
+    stages: list[Stage], run: RunFolder, source: Path, config: Config, digest: str, same_source: SameSource, redo: str
+) -> None:
+    """Raise InputError where a stage has work to do and could not. A finished one whose inputs are gone (files deleted,
+    a network removed) stays as it is."""
     for stage in stages:
         run.partial(stage.name)  # refuses a link
-    inputs, checks, records = {}, [], {**load_stale(run), **load_records(run)}
-    settled = True
+    checks, records, settled = [], {**load_stale(run), **load_records(run)}, True
     for stage in stages:
         record = records.get(stage.name)
-        settled = settled and record is not None and stage.name != redo
-        if settled and record is not None:
-            settled = not rerun_reason(stage, run, record, config, upstream, record.inputs)
-        try:
-            inputs[stage.name] = stage.inputs(source, config) if stage.inputs else None
-        except InputError as error:
-            if record is None or not settled:
-                raise
-            log.warning("%s: keeps what it was made from (%s)", stage.name, error)
-            inputs[stage.name] = record.inputs
-        if settled and record is not None:
-            settled = effective_inputs(stage, config, record, inputs[stage.name]) == record.inputs
-        upstream = next_upstream(upstream, record) if record else upstream
-        if stage is stages[0] and not settled:
+        now = Situation(stage.program, digest, config, records)
+        if settled and record and stage.name != redo and not rerun_reason(stage, run, record, now):
+            for path in record.reads.gone():
+                log.warning("%s: keeps what it was made from (%s is gone)", stage.name, path)
+            continue
+        settled = False
+        if stage is stages[0]:
             same_source()
-        if stage.check and not settled:
+        if stage.check:
             checks.append(stage.check)
     for check in checks:  # these open networks and read files, which takes longer than what is refused above
         check(source, config)
-    return inputs
 
 
-def _find_ended(stage: Stage, run: RunFolder, config: Config, fingerprint: str) -> StageRecord | None:
+def _find_ended(stage: Stage, run: RunFolder, now: Situation) -> StageRecord | None:
     """The record of this very work, if it had ended when its process was killed.
 
     How other memory would divide it cannot be asked: what the division reads may be the stage's own results, which are
     not in the manifest yet.
     """
-    record = find_sealed(run, stage.name, fingerprint)
-    if record is None or (stage.division is not None and memory_of(stage, record, config) != config.run.memory_mb):
+    record, memory = find_sealed(run, stage.name, now), now.config.run.memory_mb
+    if record is None or (stage.division and record.settings["run"]["memory_mb"] != memory):
         return None
     log.warning("%s had ended before it was interrupted: its results are taken over", stage.name)
     return record
 
 
-def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any, config: Config) -> StageRecord:
-    """Run the stage and seal its folder; `config` is what was asked for."""
+def _run_one(stage: Stage, context: StageContext, now: Situation) -> StageRecord:
+    """Run the stage and seal its folder."""
     stop_if_asked()
     run, folder = context.run, context.folder
-    _open_partial(folder, fingerprint)
+    _open_partial(folder, now)
     started = time.monotonic()
     # What caches of methods keep is a cycle: the stage before would hold its pictures and depths through this one.
     gc.collect()
     release_free_memory()
     forget_peak()
     try:
-        with stopping_after_writes(folder):
+        with stopping_after_writes(folder), ReadLog(run.root, folder, now.config):
             figures = stage.run(context)
     except InputError as error:
         if stage.name == STAGES[0] and not isinstance(error, RecoverableError):
@@ -239,22 +242,20 @@ def _run_one(stage: Stage, context: StageContext, fingerprint: str, inputs: Any,
     remove_temporaries(folder)  # of tasks whose process was killed
     files = results(folder)
     seconds, memory = time.monotonic() - started, peak_memory_mb()
-    content, settings = content_digest(files), settings_of(config, stage.name)
-    record = StageRecord(
-        fingerprint, files, seconds, memory, finite_or_none(figures), context.warnings, content, inputs, settings
-    )  # fmt: skip
+    content, settings = content_digest(files), settings_of(now.config, stage.name)
+    told, reads = finite_or_none(figures), reads_in(folder)
+    record = StageRecord(reads, files, seconds, memory, told, context.warnings, content, settings)
     seal(folder, record)
     return record
 
 
-def _open_partial(folder: Path, fingerprint: str) -> None:
-    """Keep what an interrupted attempt at exactly this work has left in the unfinished folder, else empty it. Every
-    file there is whole, for it has been flushed to the disk before it took its name."""
-    stamp = folder / FINGERPRINT
-    same = stamp.is_file() and stamp.read_text(encoding="utf-8", errors="replace") == fingerprint
-    if not same or any(links_in(folder)):  # the program makes none, and would write through those of somebody else
+def _open_partial(folder: Path, now: Situation) -> None:
+    """Keep what an interrupted attempt at this work has left in the unfinished folder where all that it has read is as
+    it was, else empty it. Every file there is whole, for it has been flushed to the disk before it took its name."""
+    # The program makes no links, and would write through those of somebody else.
+    if any(links_in(folder)) or reads_in(folder).difference(now):
         empty(folder)
-        write_text(stamp, fingerprint)
+        begin_log(folder, now)
     remove_temporaries(folder)
 
 

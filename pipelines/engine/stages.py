@@ -13,6 +13,8 @@ from ...formats.atomic import after_each_write
 from ..config import Config
 from ..run.ending import SNAPSHOT
 from ..run.folder import RunFolder
+from ..run.reads import active_log
+from ..system.identity import package_digest
 from ..system.machine import available_cpus, memory_room, release_free_memory, resolve_device
 from ..system.progress import Progress, log, stop_if_asked
 
@@ -91,7 +93,8 @@ class StageContext:
         returns its results in order. A task leaves files below `folder`, and does nothing where they are."""
         if self.workers is None:
             return [self._done(work, task) for task in tasks]
-        return self.workers.each(work, tasks, self.folder, self.progress)
+        log = active_log()
+        return self.workers.each(work if log is None else log.for_task(work), tasks, self.folder, self.progress)
 
     def _done(self, work: Callable[[T, Progress], R], task: T) -> R:
         result = work(task, self.progress)
@@ -127,20 +130,21 @@ class Later:
 class Stage:
     """`run` does the work and returns its key figures.
 
-    A stage that reads more than the stages before it says so by `inputs`: plain values that change with what it reads
-    (files, models). `check` refuses what it could not use. Both see (source, config) before the first stage runs, so
-    that a mistake is told of before anything slow. `auto` names the inputs that the settings leave to what is there
-    (networks in the cache): a finished stage keeps what was chosen when it was made. `division`: into which parts the
-    work of a finished stage is divided with these settings, where the memory that is given decides that and the result
-    with it.
+    `check` refuses files and networks that it could not use: it sees (source, config) before the first stage runs, so
+    that a mistake is told of before anything slow. `division`: into which parts the work of a finished stage is divided
+    with these settings, where the memory that is given decides that and the result with it.
     """
 
     name: str
     run: Callable[[StageContext], dict[str, Any]]
-    inputs: Callable[[Path, Config], Any] | None = None
     check: Callable[[Path, Config], None] | None = None
-    auto: Callable[[Config], tuple[str, ...]] = lambda config: ()
     division: Callable[[RunFolder, Config], Any] | None = None
+
+    @property
+    def program(self) -> str:
+        """Identity of what computes it: the package and, as methods differ, the function."""
+        of = self.run
+        return f"{package_digest()} {f'{of.module}.{of.name}' if isinstance(of, Later) else self.name}"
 
 
 def stopping_after_writes(folder: Path) -> AbstractContextManager[None]:

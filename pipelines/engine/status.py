@@ -2,17 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
-from ...formats.errors import InputError
 from ..config import STAGES, Config
 from ..run.folder import RunFolder, load_records, load_settings, load_source, load_stale, why_not_done
-from ..run.manifest import StageRecord, differing_settings
+from ..run.manifest import StageRecord
 from ..run.progress import RunProgress, load_run_progress
+from ..run.reads import Situation
 from ..system.wording import quoted
+from .runner import rerun_reason
 from .stages import Stage
-from .staleness import next_upstream, rerun_reason
 
 DONE, RUNNING, DAMAGED, INTERRUPTED = "done", "running", "damaged", "interrupted"
 OUTDATED, NOT_YET = "outdated", "not yet"
@@ -76,13 +75,15 @@ class RunStatus:
     @property
     def notes(self) -> list[str]:
         """Remarks on the run that are no fault."""
-        return [f"older results are kept: {why_not_done(self.run, name)}" for name in list(load_stale(self.run))[:1]]
+        older = [f"older results are kept: {why_not_done(self.run, name)}" for name in list(load_stale(self.run))[:1]]
+        gone = [f"{path} (read by {s.name})" for s in self.stages if s.record for path in s.record.reads.gone()]
+        return older + ([f"files that were read are gone, the results are kept: {', '.join(gone)}"] if gone else [])
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; the records without their lists of files."""
         stages = []
         for s in self.stages:
-            record = {k: v for k, v in asdict(s.record).items() if k != "files"} if s.record else None
+            record = {k: v for k, v in asdict(s.record).items() if k not in ("files", "reads")} if s.record else None
             stages.append(
                 {"name": s.name, "state": s.state, "changed": s.changed, "damaged": s.damaged, "record": record,
                  "again": s.again, "progress": asdict(s.running) if s.running else None}
@@ -107,7 +108,7 @@ def run_status(run: RunFolder, program: Program = lambda method: ()) -> RunStatu
     stages = []
     for name in STAGES:
         record = records.get(name)
-        changed = tuple(differing_settings(record, config)) if record else ()
+        changed = tuple(record.reads.changed_settings(config)) if record else ()
         damaged = tuple(run.damaged(name)) if record else ()
         why = "" if changed or damaged else again.get(name, "")
         now = running if running and running.stage == name and record is None else None
@@ -120,18 +121,12 @@ def _made_again(
     run: RunFolder, program: Sequence[Stage], records: dict[str, StageRecord], config: Config
 ) -> dict[str, str]:
     """The first stage that would be made again, and why."""
-    origin = load_source(run)
-    upstream = origin.digest
+    source = load_source(run).digest
     for stage in program:
         if (record := records.get(stage.name)) is None:
             break
-        try:
-            inputs = stage.inputs(Path(origin.path), config) if stage.inputs else None
-        except InputError:  # gone: it keeps what it was made from
-            inputs = record.inputs
-        if why := rerun_reason(stage, run, record, config, upstream, inputs):
+        if why := rerun_reason(stage, run, record, Situation(stage.program, source, config, records)):
             return {stage.name: why}
-        upstream = next_upstream(upstream, record)
     return {}
 
 

@@ -1,4 +1,4 @@
-"""Inputs of the stage beside the source, what of them is refused, and into which windows memory divides it.
+"""What is refused before the stage begins, and into which windows memory divides it.
 
 Imports nothing that computes.
 """
@@ -8,25 +8,14 @@ from pathlib import Path
 from ...formats.errors import InputError
 from ...formats.image_folder import hint_at_inner_folder
 from ..config import Config
-from ..run.extension import parent_inputs
 from ..run.files import CALIBRATION
 from ..run.folder import RunFolder, load_records
-from ..source.given import check_poses, intrinsics_inputs, pose_inputs, read_intrinsics
+from ..source.given import check_poses, read_intrinsics
 from ..source.recording import FolderRecording, Recording, open_recording
 from ..source.videos import Warn
 from ..system.machine import window_size, windows_of
-from .learned import learned_inputs, open_learned
-from .masks import check_masks, mask_inputs
-
-
-def frames_inputs(source: Path, config: Config) -> dict[str, str] | None:
-    """Return digests of the user's masks, poses and camera and of the networks, what an extended run was, and how the
-    source is read where that is not left to its looks."""
-    settings = config.frames
-    how = {} if config.run.format == "auto" else {"format": config.run.format}
-    given = pose_inputs(settings) | intrinsics_inputs(settings.intrinsics)
-    masks = mask_inputs(source, config) or {}
-    return masks | learned_inputs(settings) | given | parent_inputs(source) | how or None
+from .learned import open_learned
+from .masks import check_masks
 
 
 def frames_division(run: RunFolder, config: Config) -> list[range]:

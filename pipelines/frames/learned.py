@@ -75,15 +75,6 @@ def open_learned(settings: FramesConfig) -> LearnedFeatures | None:
     return LearnedFeatures(ModelStore.open()) if settings.features == "aliked" else None
 
 
-def learned_inputs(settings: FramesConfig) -> dict[str, str]:
-    """Return the digests of the networks, {} for SIFT. Raises InputError where they are missing."""
-    if settings.features != "aliked":
-        return {}
-    store = ModelStore.open()
-    model = _required(store)
-    return {name: store.get(name).sha256 for name in (model.name, model.needs)}
-
-
 def picture_features(
     rgb: NDArray[np.uint8], left_out: NDArray[np.bool_] | None, settings: FramesConfig, learned: LearnedFeatures | None
 ) -> Features:

@@ -14,12 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.datasets import recognise_source
 from ...formats.errors import InputError
 from ...formats.image_folder import frame_number, natural_key
 from ...formats.images import image_size, read_rgb, to_grey
 from ...formats.names import match_names
-from ...formats.reading import files_sha256
+from ...formats.reading import note_read
 from ...formats.textfile import read_json, write_json
 from ..config import Config
 from ..engine.stages import StageContext
@@ -40,17 +39,6 @@ if TYPE_CHECKING:
 _LITTLE, _LOOKED_AT = 0.05, 40
 """Share of an image that masks leave, in the middle of so many, below which they are the reason where nothing is found.
 """
-
-
-def mask_inputs(source: Path, config: Config) -> dict[str, str] | None:
-    """Return digests of the user's masks and of the networks for people; None without any."""
-    # Only data sets name masks: of others nothing is opened, which may be gone when their stage is done.
-    names_masks = config.run.format != "images" and recognise_source(source) is not None
-    files = MaskFiles({})
-    if config.frames.masks or names_masks:
-        files = masks_for(config, open_recording(source, config.run.format))
-    cards, found = _cards(config), {"masks": files.digest()} if files.paths else {}
-    return found | ({"people": cards.identity()} if cards else {}) or None
 
 
 def check_masks(source: Path, config: Config) -> None:
@@ -228,10 +216,6 @@ class MaskFiles:
             return None
         return reduce_mask(np.rot90(read_rgb(path).max(-1) == 0, self.turns.get(index, 0)), width, height)
 
-    def digest(self) -> str:
-        """Changes with the names and contents."""
-        return files_sha256((p.name, p) for p in self.paths.values())
-
 
 def _nearer(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(h, w) the pixels that are nearer to one area (h, w) than to another."""
@@ -261,6 +245,8 @@ def open_masks(folder: Path, source: Recording) -> MaskFiles:
     if not folder.is_dir():
         raise InputError(f"--masks {folder}: there is no such folder")
     files = sorted((p for p in folder.rglob("*.png") if p.is_file()), key=lambda p: natural_key(p.name))
+    for place in (folder, *(p for p in folder.rglob("*") if p.is_dir())):
+        note_read(place)
     if not files:
         raise InputError(f"--masks {folder}: holds no PNG files. A mask is an 8 bit PNG, black is left out")
     paths, strangers = _by_number(files, source) if isinstance(source, VideoRecording) else _by_name(files, source)

@@ -1,18 +1,10 @@
 """Which frames the map is made of, and into how many submaps memory divides it; imports nothing that computes."""
 
-from pathlib import Path
-
 from ..config import Config
-from ..run.extension import parent_inputs
 from ..run.files import CALIBRATION, TRAJECTORY
 from ..run.folder import RunFolder
 from ..system.machine import submap_size
 from ..types import Trajectory
-
-
-def mapping_inputs(source: Path, config: Config) -> dict[str, str] | None:
-    """Return what an extended run was, None for any other."""
-    return parent_inputs(source) or None
 
 
 def mapping_division(run: RunFolder, config: Config) -> int:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...formats.errors import InputError
 from ..networks.card import Card
 from ..networks.registry import ModelStore
-from ..networks.session import Network, card_identity
+from ..networks.session import Network
 
 _MAYBE = 0.3
 """Probability of the class from which pixels form a candidate."""
@@ -37,10 +37,6 @@ class PeopleCards:
 
     person: Card
     classes: Card
-
-    def identity(self) -> str:
-        """Changes with the networks."""
-        return card_identity(self.person) + card_identity(self.classes)
 
 
 def people_cards(store: ModelStore) -> PeopleCards | None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...formats.atomic import atomic_path
 from ...formats.errors import InputError
+from ...formats.reading import noting_files
 from ...formats.tensors import load_arrays
 from ..providers import Sequence
 from ..system.progress import Progress, log
@@ -46,7 +47,8 @@ class ResultCache:
         try:
             if self.megabytes <= 0 or not path.exists():
                 return None
-            found = load_arrays(path)
+            with noting_files():  # what made it is in its name
+                found = load_arrays(path)
             if found.pop(_STAMP, np.array("")).tolist() != _stamp(key, found):
                 return None
             os.utime(path)

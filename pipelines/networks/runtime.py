@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError, install_command
-from ...formats.reading import opened, parsing, read_bytes
+from ...formats.reading import note_read, opened, parsing, read_bytes
 from ..system.progress import log
 
 _MAGIC = b"TFL3"
@@ -133,6 +133,7 @@ def require_own_weights(path: Path) -> None:
             )
         if not target.is_file():
             raise InputError(f"{path}: its weights {location} are not beside it. Download that file as well")
+        note_read(target)
 
 
 def external_locations(path: Path) -> list[str]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError
-from ...formats.reading import file_sha256, files_sha256
+from ...formats.reading import file_sha256, files_sha256, note_read
 from .card import Card
 from .runtime import external_locations, is_tflite, open_runtime, require_own_weights
 from .words import LinearHead, WordHead, load_linear_head, load_word_head
@@ -239,6 +239,10 @@ def card_identity(card: Card) -> str:
     end of a command.
     """
     files = [*filter(None, (card.model, card.head, card.text, card.tokenizer))]
+    if not is_tflite(card.model):
+        require_own_weights(card.model)
+    for file in files:  # what is known already is not opened again
+        note_read(file)
     return _identity(card, tuple((s.st_size, s.st_mtime_ns) for s in (p.stat() for p in files if p.exists())))
 
 
@@ -246,7 +250,6 @@ def card_identity(card: Card) -> str:
 def _identity(card: Card, _: tuple[tuple[int, int], ...]) -> str:
     beside = []
     if not is_tflite(card.model):  # those carry all of their weights
-        require_own_weights(card.model)
         beside = [card.model.parent / name for name in external_locations(card.model)]
     files = [*filter(None, (card.model, card.head, card.text, card.tokenizer)), *beside]
     contract = repr(replace(card, model=Path(card.model.name), head=None, text=None, tokenizer=None))

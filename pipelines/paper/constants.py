@@ -1,7 +1,6 @@
 """Constants of the paper by its own names, with the values of its section 4.1 (or of the text around the equation)."""
 
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 from ..config import Config
 
@@ -91,13 +90,3 @@ def constants_of(config: Config) -> Constants:
     if config.mapping.use_proxy_depth and config.mapping.depth_weight > 0:
         return chosen
     return replace(chosen, track_depth=0.0, map_depth=0.0)
-
-
-def paper_inputs(source: Path, config: Config) -> dict[str, float]:
-    """Constants come from settings of other stages too, and so does which frames the map is not made from."""
-    return asdict(constants_of(config)) | {"hold_out": config.mapping.hold_out}
-
-
-def final_inputs(source: Path, config: Config) -> dict[str, float]:
-    """The last passes are of images of the size that `mapping.max_side` says."""
-    return paper_inputs(source, config) | {"max_side": config.mapping.max_side}

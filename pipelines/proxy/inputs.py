@@ -1,4 +1,4 @@
-"""Inputs of the stage beside the frames: the user's files and networks, checked before anything slow starts."""
+"""What is refused before anything slow starts: files and networks that the stage could not use."""
 
 from __future__ import annotations
 
@@ -6,50 +6,19 @@ from pathlib import Path
 from typing import Any
 
 from ...formats.errors import InputError
-from ...formats.reading import files_sha256
 from ..config import Config
 from ..networks.registry import missing_networks
-from ..networks.session import card_identity
 from ..providers import Sequence
 from ..source.recording import open_recording
 from ..system.progress import SilentProgress, log
 from ..types import Calibration, Frame, Intrinsics
 from .selection import (
-    AUTO,
     ProviderContext,
     choose_depth,
     choose_semantics,
-    open_depth_files,
-    open_label_files,
     open_learned_depth,
     open_learned_semantics,
 )
-
-
-def proxy_inputs(source: Path, config: Config) -> dict[str, Any]:
-    """Values that change with what the providers read: the files' names and contents, the network and its card, and
-    whether people are looked for, who are then no class of the scene.
-
-    Raises InputError for folders and files that do not fit the source, and for a card that is none.
-    """
-    depth, semantics = choose_depth(config.proxy), choose_semantics(config.proxy)
-    chosen = {"depth": depth, "labels": semantics}
-    identities = {k: c.kind if c.card is None else card_identity(c.card) for k, c in chosen.items()}
-    if config.frames.people != "auto":
-        identities["people"] = config.frames.people
-    if "files" in (depth.kind, semantics.kind):
-        around = _before_frames(source, config)
-        if depth.kind == "files":
-            identities["depth"] = _digest_of(open_depth_files(around, depth.folder).files())
-        if semantics.kind == "files":
-            identities["labels"] = _digest_of(open_label_files(around, semantics.folder).files())
-    return identities
-
-
-def left_to_auto(config: Config) -> tuple[str, ...]:
-    """Which of them the networks in the cache decide."""
-    asked = {"depth": config.proxy.depth, "labels": config.proxy.semantics}
-    return tuple(name for name, text in asked.items() if text.partition(":")[0].strip() in AUTO)
 
 
 def check_proxy(source: Path, config: Config) -> None:
@@ -78,10 +47,6 @@ def check_proxy(source: Path, config: Config) -> None:
         if isinstance(provider, FilesDepth | FilesLabels):
             require_sizes(provider.files(), provider.turned(), around.sequence)
             provider.require_content()
-
-
-def _digest_of(files: list[Path]) -> str:
-    return files_sha256((p.name, p) for p in files)
 
 
 def _before_frames(source: Path, config: Config) -> ProviderContext:

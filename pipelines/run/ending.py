@@ -1,7 +1,7 @@
 """The end of a stage, in steps of which each may be the last one before a kill:
 
     1. its record, with the checksums of all results, is written into the unfinished folder: from here on it is finished
-    2. snapshot and stamp are removed
+    2. snapshot and notes of what was read are removed
     3. the folder of an earlier result is renamed aside and removed; what others have put into the export's is kept
     4. the unfinished folder takes the name of the stage
     5. the manifest names the stage
@@ -25,16 +25,17 @@ from ..config import STAGES
 from ..system.progress import log
 from .folder import RunFolder
 from .manifest import StageRecord, content_digest
+from .reads import LOGS, Situation
 from .schema import dataclass_from_json
 from .target import LIST, keep_others
 
-FINGERPRINT, SNAPSHOT, RECORD = "fingerprint", "snapshot", ".record.json"
-"""In an unfinished folder: the work that it belongs to, the folder of snapshots, the record of a stage that ended."""
+SNAPSHOT, RECORD = "snapshot", ".record.json"
+"""In an unfinished folder: the folder of snapshots, the record of a stage that ended."""
 
 
 def results(folder: Path) -> dict[str, tuple[int, str]]:
     """Relative path → (bytes, sha256) of every result in a stage's folder, finished or not."""
-    return checksums(folder, but=(FINGERPRINT, SNAPSHOT, RECORD, LIST))
+    return checksums(folder, but=(LOGS, SNAPSHOT, RECORD, LIST))
 
 
 def checksums(folder: Path, but: tuple[str, ...] = ()) -> dict[str, tuple[int, str]]:
@@ -48,13 +49,13 @@ def seal(folder: Path, record: StageRecord) -> None:
     write_json(folder / RECORD, asdict(record))
 
 
-def find_sealed(run: RunFolder, name: str, fingerprint: str) -> StageRecord | None:
+def find_sealed(run: RunFolder, name: str, now: Situation) -> StageRecord | None:
     """Find the record of a stage that ended without entering the manifest; None where there is none of this very work,
     or a file is not as it says."""
     for folder in (run.partial(name), run.stage(name)):
         with suppress(InputError), parsing(folder / RECORD, "record of a stage"):
             record = dataclass_from_json(StageRecord, read_json_object(folder / RECORD, MAX_OWN_JSON_BYTES))
-            if record.fingerprint != fingerprint or content_digest(record.files) != record.content:
+            if record.reads.difference(now) or content_digest(record.files) != record.content:
                 continue
             found = results(folder)
             if all(found.get(file) == expected for file, expected in record.files.items()):
@@ -68,7 +69,7 @@ def move_in(run: RunFolder, name: str) -> None:
     if not (folder / RECORD).exists():
         return
     shutil.rmtree(folder / SNAPSHOT, ignore_errors=True)
-    (folder / FINGERPRINT).unlink(missing_ok=True)
+    shutil.rmtree(folder / LOGS, ignore_errors=True)
     if name == STAGES[-1]:
         _keep_others(target, folder)
     discard(target)

@@ -103,12 +103,6 @@ def parent_of(source: Path) -> ParentRun | None:
     return ParentRun(source.parent) if is_extended else None
 
 
-def parent_inputs(source: Path) -> dict[str, str]:
-    """Return the digest of that state as an input of a stage, {} where there is none."""
-    before = parent_of(source)
-    return {} if before is None else {"before": file_sha256(before.folder / CONTENTS)}
-
-
 def save_parent(run: RunFolder, folder: Path) -> None:
     """Write that state into a folder, the table of contents last. Raises InputError where the run is damaged."""
     frames, trajectory, backbone = run.load(FRAMES), run.load(TRAJECTORY, FINAL), run.find(BACKBONE)

@@ -31,6 +31,7 @@ from ..system.wording import quoted
 from ..types import Frame, ProxyMaps, any_of
 from .files import LEFT_OUT, PROXY_MAPS, SPARSE
 from .manifest import Manifest, Source, StageRecord, previous_settings, read_manifest, recorded_config
+from .reads import digest_of_result, note_result
 from .schema import RunFile
 
 T = TypeVar("T")
@@ -108,7 +109,10 @@ class RunFolder:
         manifest = self.manifest()
         if manifest is None:
             return self.path(stage, name).exists()
-        return stage in manifest.records and name in manifest.records[stage].files
+        if stage not in manifest.records:
+            return False
+        note_result(self.root, stage, name, lambda: digest_of_result(manifest.records[stage], name))
+        return name in manifest.records[stage].files
 
     def file(self, stage: str, name: str) -> Path:
         """A file of a finished stage, for reading.
@@ -122,6 +126,7 @@ class RunFolder:
             return path
         if stage not in manifest.records:
             raise InputError(f"{self.root}: {why_not_done(self, stage)}")
+        note_result(self.root, stage, name, lambda: digest_of_result(manifest.records[stage], name))
         expected = manifest.records[stage].files.get(name)
         if expected is None or not self._is_intact(stage, name, *expected):
             what = "is gone" if not path.is_file() else "is not as the program left it: damaged or changed"

@@ -14,9 +14,10 @@ from ...formats.textfile import MAX_OWN_JSON_BYTES, read_json_object, write_json
 from ..config import STAGES, Config, config_to_dict
 from ..read_config import merge_known_settings
 from ..system.wording import quoted
+from .reads import Reads
 from .schema import dataclass_from_json
 
-FORMAT = 2
+FORMAT = 3
 """Of manifest.json."""
 
 
@@ -30,17 +31,17 @@ class Source:
 
 @dataclass(frozen=True)
 class StageRecord:
-    """One finished stage. files: relative path → [bytes, sha256]; settings: {"run": ..., its own section: ...}, those
-    that it was made with, whatever run.toml says by now; of a stale one the sections of the other stages, too."""
+    """One finished stage. reads: what it was made from; files: relative path → [bytes, sha256]; settings: {"run": ...,
+    its own section: ...}, those that it was made with, whatever run.toml says by now; of a stale one the sections of
+    the other stages, too."""
 
-    fingerprint: str
+    reads: Reads
     files: dict[str, tuple[int, str]]
     seconds: float
     peak_memory_mb: float
     figures: dict[str, Any]
     warnings: list[str]
     content: str
-    inputs: Any = None
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
@@ -115,7 +116,7 @@ def settings_of(config: Config, stage: str) -> dict[str, dict[str, Any]]:
 
 
 def differing_settings(record: StageRecord, config: Config) -> list[str]:
-    """`section.key=value` of each setting of its own section that `config` has otherwise than the record."""
+    """`section.key=value` of each setting that `config` has otherwise than the record keeps of it, read or not."""
     return [
         f"{section}.{key}={value}"
         for section, values in record.settings.items()

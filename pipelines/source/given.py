@@ -15,7 +15,7 @@ from ...formats.errors import InputError
 from ...formats.image_folder import frame_number
 from ...formats.names import match_names, stem
 from ...formats.poses import PoseFile, read_poses
-from ...formats.reading import file_sha256, files_sha256, home_expanded, noting_files, reaching
+from ...formats.reading import home_expanded, reaching
 from ...formats.textfile import read_rows
 from ..config import FramesConfig
 from ..types import Frame, GivenPoses
@@ -94,17 +94,6 @@ def check_poses(config: FramesConfig, source: Recording) -> None:
         given_poses(config, source, pictures)
 
 
-def pose_inputs(config: FramesConfig) -> dict[str, str]:
-    """Return the digest of the files that `read_poses` reads; {} where none are given. Raises InputError as it does."""
-    if not config.poses:
-        return {}
-    path = home_expanded(config.poses)
-    with noting_files() as files:
-        read_poses(path)
-    named = sorted({(file.relative_to(path).as_posix(), file) for file in files})
-    return {"poses": files_sha256(named)}
-
-
 def _by_name(file: PoseFile, source: Recording, frames: Sequence[Frame], path: str) -> NDArray[np.float64]:
     """A video's frames are called by their numbers."""
     if isinstance(source, VideoRecording):
@@ -155,13 +144,6 @@ def read_intrinsics(text: str, width: int, height: int) -> Camera:
         return _from_numbers(numbers, width, height, f"intrinsics {text}")
     path, name = _named_file(text)
     return _fit_to_source(_from_file(path, name, width, height), width, height, path)
-
-
-def intrinsics_inputs(text: str) -> dict[str, str]:
-    """Return the digest of the file that `frames.intrinsics` names; {} for numbers and for none."""
-    if not text or _numbers(text.replace(",", " ").split()) is not None:
-        return {}
-    return {"intrinsics": file_sha256(_named_file(text)[0])}
 
 
 def _named_file(text: str) -> tuple[Path, str]:

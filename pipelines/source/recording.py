@@ -33,6 +33,7 @@ from ...formats.reading import (
 )
 from ...formats.video import VideoFrame, VideoReader, probe_video
 from ..run.folder import RunFolder
+from ..run.reads import cover_files
 from .headers import Headers, common_span, read_headers, require_one_lens
 from .videos import Warn, common_focal, video_files, warn_of_video
 
@@ -112,7 +113,7 @@ class Recording(ABC):
         return None
 
 
-_opened: dict[tuple[Path, str], tuple[FileStamps, Recording]] = {}
+_opened: dict[tuple[Path, str], tuple[FileStamps, list[Path], Recording]] = {}
 """The last one that was opened, and the files that this has read."""
 
 
@@ -122,16 +123,17 @@ def open_recording(path: Path, format: str = "auto") -> Recording:
     format: `auto` looks for what the path is; `images` takes it for a video or plain images in any case; else a data
     set's. Raises InputError when there is no such file, it is no video, it holds no image, or images differ in size.
     """
-    require_source(path)
     key = (path.absolute(), format)
-    if (known := _opened.get(key)) is not None and known[0].are_current():
-        return known[1]
     with noting_files() as files:
-        recording = _open(path, format)
-    folders = [] if isinstance(recording, VideoRecording) else [path, *(file.parent for file in files)]
-    _opened.clear()
-    _opened[key] = FileStamps.of([*files, *folders]), recording
-    return recording
+        require_source(path)
+        if (known := _opened.get(key)) is None or not known[0].are_current():
+            recording = _open(path, format)
+            images = recording.sequence.image_paths if isinstance(recording, ImageRecording) else ()
+            folders = [] if isinstance(recording, VideoRecording) else [path, *(file.parent for file in files)]
+            _opened.clear()
+            known = _opened[key] = FileStamps.of([*files, *folders]), [*files, *images], recording
+    cover_files(known[1])
+    return known[2]
 
 
 def _open(path: Path, format: str) -> Recording:

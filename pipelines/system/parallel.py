@@ -6,6 +6,7 @@ import itertools
 from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
 from threading import Lock
 from typing import Generic, TypeVar, overload
 
@@ -22,11 +23,16 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T], threads: int, b
     """`map` on threads, in order; at most `begun` items (0: two a thread) are in work or wait in memory."""
     items, threads = iter(items), max(1, threads)
     with ThreadPoolExecutor(threads) as pool:
-        waiting = deque(pool.submit(function, item) for item in itertools.islice(items, begun or 2 * threads))
+        waiting = deque(_submitted(pool, function, item) for item in itertools.islice(items, begun or 2 * threads))
         while waiting:
             result = waiting.popleft().result()
-            waiting.extend(pool.submit(function, item) for item in itertools.islice(items, 1))
+            waiting.extend(_submitted(pool, function, item) for item in itertools.islice(items, 1))
             yield result
+
+
+def _submitted(pool: ThreadPoolExecutor, function: Callable[[T], R], item: T) -> Future[R]:
+    """What is noted of this thread's work is noted of the pool's."""
+    return pool.submit(copy_context().run, function, item)
 
 
 def map_lookahead(function: Callable[[T], R], items: Iterable[T], threads: int) -> Iterator[R]:

@@ -25,13 +25,13 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.textfile import read_json_object, write_json
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.engine.stages import Stage
-from msgs_slam.pipelines.engine.staleness import next_upstream, stage_fingerprint
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.read_config import config_to_toml, load_config
 from msgs_slam.pipelines.reconstruct import all_stages, reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings, load_source, save_settings
 from msgs_slam.pipelines.run.manifest import Manifest, StageRecord, write_manifest
+from msgs_slam.pipelines.run.reads import Reads
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 
 COMPLETE = "complete"
@@ -282,14 +282,13 @@ def branch(
 
 
 def _accepted(
-    records: dict[str, StageRecord], stages: list[Stage], config: Config, upstream: str
+    records: dict[str, StageRecord], stages: list[Stage], config: Config, source: str
 ) -> dict[str, StageRecord]:
     accepted = {}
     for stage in stages:
         if (record := records.get(stage.name)) is None:
             break
-        accepted[stage.name] = replace(record, fingerprint=stage_fingerprint(stage, config, upstream, record.inputs))
-        upstream = next_upstream(upstream, record)
+        accepted[stage.name] = replace(record, reads=Reads(stage.program, source))
     return accepted
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from cli_runs import QUICK, FinishedRun, files_below, invoke
 
-from msgs_slam.pipelines.engine import staleness
+from msgs_slam.pipelines.engine import stages
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_source
 from msgs_slam.pipelines.run.lock import locked
@@ -45,7 +45,8 @@ def test_networks_that_are_pulled_later_make_nothing_again(
     run = copied_run("run.msgs")
     assert invoke("models", "pull", "--from", shared_data / "models").exit_code == 0
     require_unchanged_by_resume(run)
-    assert {row["again"] for row in json.loads(invoke("status", run, "--json").stdout)["stages"]} == {""}
+    told = json.loads(invoke("status", run, "--json").stdout)
+    assert (told["notes"], {row["again"] for row in told["stages"]}) == ([], {""})
 
 
 def test_a_stage_is_made_again_on_demand_with_the_networks_of_now(
@@ -67,6 +68,10 @@ def test_a_stage_is_made_again_on_demand_with_the_networks_of_now(
     assert files_below(run / "frames", run / "tracking") == times, (
         "later results stay until their own new ones are ready"
     )
+    shutil.rmtree(cache)
+    said = " ".join(invoke("status", run).stdout.split())
+    assert f"files that were read are gone, the results are kept: {cache}" in said
+    assert "(read by proxy)" in said
 
 
 def test_a_folder_that_is_gone_is_called_so(copied_run: Callable[[str], Path]) -> None:
@@ -96,7 +101,7 @@ def test_files_of_options_are_found_from_another_folder_and_may_be_gone_when_the
     (tmp_path / "poses.txt").unlink()
     kept = invoke("resume", "../run.msgs", "--until", "frames")
     assert kept.exit_code == 0, kept.stderr
-    assert "frames: keeps what it was made from (--poses" in kept.stderr
+    assert f"frames: keeps what it was made from ({tmp_path / 'poses.txt'} is gone)" in " ".join(kept.stderr.split())
     assert "up to date" in kept.stderr
     other = invoke("resume", "../run.msgs", "--until", "frames", "--set", "frames.parallax=0.05")
     assert other.exit_code == 1
@@ -108,7 +113,7 @@ def test_status_says_what_another_version_would_make_again(
 ) -> None:
     run = copied_run("run.msgs")
     assert json.loads(invoke("status", run, "--json").stdout)["warnings"] == []
-    monkeypatch.setattr(staleness, "package_digest", lambda: "new")
+    monkeypatch.setattr(stages, "package_digest", lambda: "new")
     before = contents(run)
     said = " ".join(invoke("status", run).stdout.split())
     assert "frames was made otherwise (another version of the program made it" in said

@@ -6,6 +6,7 @@ from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.run.ending import results
 from msgs_slam.pipelines.run.folder import RunFolder, save_settings
 from msgs_slam.pipelines.run.manifest import Manifest, Source, StageRecord, content_digest, settings_of, write_manifest
+from msgs_slam.pipelines.run.reads import Reads
 
 
 def note_finished(
@@ -16,7 +17,7 @@ def note_finished(
     records = {}
     for name in stages:
         files = results(run.stage(name))
-        settings = settings_of(config, name)
-        records[name] = StageRecord("", files, seconds, 50 * seconds, {}, [], content_digest(files), None, settings)
+        content, settings = content_digest(files), settings_of(config, name)
+        records[name] = StageRecord(Reads(), files, seconds, 50 * seconds, {}, [], content, settings)
     write_manifest(run.manifest_file, Manifest(Source(source, ""), records))
     save_settings(run, config)

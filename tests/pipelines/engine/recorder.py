@@ -38,13 +38,14 @@ class Recorder:
     def _make(self, name: str) -> Callable[[StageContext], dict[str, Any]]:
         def run(context: StageContext) -> dict[str, Any]:
             self.ran.append(name)
+            own = f"{getattr(context.config, name)} {context.config.run.seed}"
             before = STAGES[STAGES.index(name) - 1] if name != STAGES[0] else None
-            text = (context.run.stage(before) / "result.txt").read_text() if before else "source"
+            text = context.run.file(before, "result.txt").read_text() if before else "source"
             write_text(context.snapshot / "half.txt", "half")
             if name == self.fail_in:
                 raise self.error
             for file in ("result.txt", "folder/0.txt"):
-                write_text(context.folder / file, f"{text} > {name} {getattr(context.config, name)}")
+                write_text(context.folder / file, f"{text} > {name} {own}")
             if name == "mapping":
                 self.at_end()
             return {"length": len(text), "number": float("inf")}

@@ -7,10 +7,15 @@ from typing import Any
 
 import pytest
 
+from msgs_slam.formats.atomic import write_text
 from msgs_slam.formats.errors import DiskFullError, InputError
+from msgs_slam.formats.reading import note_read
+from msgs_slam.formats.textfile import read_text
 from msgs_slam.pipelines.config import STAGES, Config, MappingConfig
+from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_stale
+from msgs_slam.pipelines.run.reads import LOGS
 from tests.pipelines.engine.recorder import Recorder
 
 
@@ -178,19 +183,24 @@ def test_full_disk_is_said_and_can_be_resumed(recorder: Recorder, tmp_path: Path
     assert recorder.bring(tmp_path / "r") == ["tracking", "mapping", "global_ba", "export"]
 
 
-def test_inputs_of_a_stage_are_looked_at_first_and_rerun_it_when_they_change(
+def test_what_a_stage_could_not_use_is_refused_first_and_other_files_make_it_again(
     recorder: Recorder, tmp_path: Path
 ) -> None:
     maps = tmp_path / "maps.txt"
     checked: list[str] = []
 
-    def inputs(source: Path, config: Config) -> str:
+    def check(source: Path, config: Config) -> None:
         if not maps.exists():
             raise InputError(f"{maps} is not there")
-        return maps.read_text()
+        checked.append(maps.read_text())
+
+    def run(context: StageContext) -> dict[str, Any]:
+        read_text(maps)
+        return plain.run(context)
 
     stages = recorder.stages()
-    stages[1] = replace(stages[1], inputs=inputs, check=lambda source, config: checked.append(maps.read_text()))
+    plain = stages[1]
+    stages[1] = replace(plain, run=run, check=check)
     bring = partial(recorder.bring, tmp_path / "r", stages=stages)
     with pytest.raises(InputError, match="is not there"):
         bring()
@@ -224,19 +234,65 @@ def test_memory_that_divides_a_stage_otherwise_makes_it_again(recorder: Recorder
     assert bring(900) == []
 
 
-def test_a_finished_stage_keeps_what_auto_has_chosen(recorder: Recorder, tmp_path: Path) -> None:
-    there = {"depth": "files", "labels": "segments"}
-    auto = ["labels"]
-    stages = recorder.stages()
-    stages[1] = replace(stages[1], inputs=lambda source, config: dict(there), auto=lambda config: tuple(auto))
+def test_only_what_a_stage_reads_makes_it_again(recorder: Recorder, tmp_path: Path) -> None:
+    """Settings of its own section that it does not ask for are none of it, those of another one that it does ask for
+    are; so is a file that was not there."""
+    given = tmp_path / "given"
 
-    bring = partial(recorder.bring, tmp_path / "r", stages=stages)
-    assert bring() == list(STAGES)
-    there["labels"] = "a network"
-    assert bring() == []
-    there["depth"] = "other files"
-    assert bring() == ["proxy"]  # and then everything is chosen anew
-    assert load_records(RunFolder(tmp_path / "r"))["proxy"].inputs == there
-    auto.clear()
-    there["labels"] = "another network"
-    assert bring() == ["proxy"]
+    def run(context: StageContext) -> dict[str, Any]:
+        recorder.ran.append("frames")
+        value = context.config.frames.rate, context.config.mapping.submap, context.threads
+        write_text(context.folder / "result.txt", f"{value} {given.exists() and [p.name for p in given.iterdir()]}")
+        note_read(given)
+        return {}
+
+    stages = recorder.stages()
+    stages[0] = Stage("frames", run)
+
+    def bring(*settings: str) -> bool:
+        ran = recorder.bring(tmp_path / "r", load_config(overrides=settings), until="frames", stages=stages)
+        return ran == ["frames"]
+
+    assert bring()
+    assert not bring("frames.overlap=3", "mapping.passes=2", "run.threads=2", "run.device=cpu")
+    assert bring("frames.rate=5")
+    assert bring("frames.rate=5", "mapping.submap=9")
+    assert not bring("frames.rate=5", "mapping.submap=9", "mapping.max_side=99")
+    given.mkdir()
+    assert bring("frames.rate=5", "mapping.submap=9")
+    (given / "more.txt").touch()
+    assert bring("frames.rate=5", "mapping.submap=9")
+    (given / "more.txt").write_text("text")
+    assert not bring("frames.rate=5", "mapping.submap=9")
+
+
+def test_unfinished_work_goes_on_unless_something_that_it_has_read_has_changed(
+    recorder: Recorder, tmp_path: Path
+) -> None:
+    stages = recorder.stages()
+
+    def run(context: StageContext) -> dict[str, Any]:
+        if context.config.frames.rate and (context.snapshot / "first").exists():
+            return {}
+        write_text(context.snapshot / "first", "")
+        read_text(tmp_path / "given.txt")
+        raise KeyboardInterrupt
+
+    def goes_on(*settings: str) -> bool:
+        try:
+            recorder.bring(tmp_path / "r", load_config(overrides=settings), until="frames", stages=stages)
+        except KeyboardInterrupt:
+            return False
+        return True
+
+    stages[0] = Stage("frames", run)
+    (tmp_path / "given.txt").write_text("one")
+    assert not goes_on()
+    (tmp_path / "given.txt").write_text("two")
+    assert not goes_on()
+    assert not goes_on("frames.rate=5")
+    log = next((tmp_path / "r" / "frames.partial" / LOGS).iterdir())
+    log.write_text(log.read_text() + '["settings", "frames.ra')  # killed in the middle
+    assert goes_on("frames.rate=5", "frames.overlap=3")
+    reads = load_records(RunFolder(tmp_path / "r"))["frames"].reads
+    assert list(reads.files) == [str(tmp_path / "given.txt")], "read before the interruption"

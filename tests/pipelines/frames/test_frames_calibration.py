@@ -11,12 +11,12 @@ import pytest
 
 from msgs_slam.formats.datasets.sequence import Camera
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.config import Config, FramesConfig, RunConfig
+from msgs_slam.formats.poses import read_poses
+from msgs_slam.formats.reading import noting_files
 from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.frames.inputs import frames_inputs
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.sfm.lens import distortion_of, make_lens, set_lens, to_pycolmap, unknown_camera
-from msgs_slam.pipelines.source.given import pose_inputs, read_intrinsics
+from msgs_slam.pipelines.source.given import read_intrinsics
 from msgs_slam.pipelines.source.recording import FolderRecording
 from tests.pipelines.frames.conftest import Walk
 
@@ -200,46 +200,23 @@ def test_what_opencv_writes_is_read(suffix: str, tmp_path: Path) -> None:
     assert read_intrinsics(str(path), 640, 480) == Camera(640, 480, 525, 526, 320, 240, (0.1, -0.2, 1e-5, 0, 0.05))
 
 
-def test_a_calibration_file_that_has_changed_makes_the_stage_again(tmp_path: Path, bent_walk: Walk) -> None:
-    path = tmp_path / "camera.txt"
-    asked = Config(frames=FramesConfig(intrinsics=str(path), people="off"))
-
-    def inputs(text: str) -> dict[str, str] | None:
-        path.write_text(text)
-        return frames_inputs(bent_walk.folder, asked)
-
-    before = inputs("500 500 320 240")
-    assert before is not None
-    assert inputs("510 510 320 240") != before == inputs("500 500 320 240")
-    numbers = Config(frames=FramesConfig(intrinsics="500,500,320,240", people="off"))
-    assert frames_inputs(bent_walk.folder, numbers) is None
-
-
 def test_the_files_that_poses_are_read_from_are_an_input_and_no_others(tmp_path: Path) -> None:
     """A COLMAP project has gigabytes beside its model, and apps keep poses in files of any suffix."""
     line = "{}, {:06d}, {}, 0, 0, 0, 0, 0, 1\n"
     head = "timestamp, frame, x, y, z, qx, qy, qz, qw\n"
     quaternion = [0, 0, 0, 1]
-    for name, good, other in (
-        ("odometry.csv", head + line.format(0, 0, 1), head + line.format(0, 0, 2)),
-        ("metadata", json.dumps({"poses": [[*quaternion, 0, 0, 1]]}), json.dumps({"poses": [[*quaternion, 0, 0, 2]]})),
+    for name, good in (
+        ("odometry.csv", head + line.format(0, 0, 1)),
+        ("metadata", json.dumps({"poses": [[*quaternion, 0, 0, 1]]})),
     ):
         (folder := tmp_path / name.partition(".")[0]).mkdir()
         (folder / name).write_text(good)
-        settings = FramesConfig(poses=str(folder))
-        before = pose_inputs(settings)
         (folder / "dense").mkdir()
         for unread in ("dense/depth.bin", "dense/notes.txt", "other.json"):
             (folder / unread).write_text("{}")
-        assert pose_inputs(settings) == before, name
-        (folder / name).write_text(other)
-        assert pose_inputs(settings) != before, name
-
-
-def test_a_format_that_is_asked_for_is_an_input(bent_walk: Walk) -> None:
-    asked = Config(run=RunConfig(format="images"))
-    assert frames_inputs(bent_walk.folder, Config()) is None
-    assert frames_inputs(bent_walk.folder, asked) == {"format": "images"}
+        with noting_files() as files:
+            read_poses(folder)
+        assert files == [folder / name]
 
 
 @pytest.mark.parametrize("suffix", [".txt", ".bin"])

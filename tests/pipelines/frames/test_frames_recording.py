@@ -19,7 +19,6 @@ from msgs_slam.pipelines.frames.keyframes import pick_frames
 from msgs_slam.pipelines.frames.tasks import known_camera
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.providers import Sequence as ProxySequence
-from msgs_slam.pipelines.proxy.inputs import proxy_inputs
 from msgs_slam.pipelines.proxy.recording import RecordingDepth, RecordingLabels
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth_files, open_label_files
 from msgs_slam.pipelines.read_config import load_config
@@ -99,8 +98,6 @@ def test_depth_and_labels_of_the_set_are_the_oracle(layout: str, short: Sequence
     assert found.depth.shape == (90, 120)
     assert np.abs(found.depth - wanted[1::2, 1::2]).max() < 2e-3
     assert (found.confidence == (found.depth > 0)).all()
-    before = proxy_inputs(path, _config("files", "files" if has_labels else "segments"))
-    assert before["depth"] != proxy_inputs(path, _config("multiview", "segments"))["depth"]
     if not has_labels:
         with pytest.raises(InputError, match="has no labels: --semantics files:FOLDER"):
             open_label_files(around, "")

@@ -17,6 +17,7 @@ from msgs_slam.pipelines.run.ending import checksums
 from msgs_slam.pipelines.run.files import CALIBRATION
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.manifest import Manifest, Source, StageRecord, write_manifest
+from msgs_slam.pipelines.run.reads import Reads
 from msgs_slam.pipelines.sfm.adjust import adjust_model, model_errors
 from msgs_slam.pipelines.sfm.consistency import judge
 from msgs_slam.pipelines.sfm.joining import (
@@ -239,7 +240,7 @@ def test_memory_makes_only_frames_of_long_recordings_again(keyframes: int, diffe
     run = RunFolder(tmp_path)
     CALIBRATION.save(run.stage("frames"), Calibration(CAMERA, "given", 0.0, (0, 0, 0, 0)))
     files = checksums(run.stage("frames"))
-    record = StageRecord("", files, 0, 0, {"keyframes": keyframes}, [], "")
+    record = StageRecord(Reads(), files, 0, 0, {"keyframes": keyframes}, [], "")
     write_manifest(run.manifest_file, Manifest(Source("", ""), {"frames": record}))
     whole, parts = (frames_division(run, load_config(None, [f"run.memory_mb={mb}"])) for mb in (0, 1100))
     assert (whole != parts) == differs

@@ -17,7 +17,7 @@ from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.depth.stereo.sweep import sweep_cost
 from msgs_slam.pipelines.depth.stereo.volume import Bands
 from msgs_slam.pipelines.frames.keyframes import choose_keyframes
-from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, mask_inputs, open_masks
+from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, open_masks
 from msgs_slam.pipelines.geometry.voxels import to_lab
 from msgs_slam.pipelines.mapping.objective import Objective
 from msgs_slam.pipelines.mapping.views import View, make_view
@@ -93,15 +93,6 @@ def test_masks_of_another_name_or_size_are_refused_before_anything_slow(
         check_masks(pictures, load_config(overrides=[f'frames.masks="{tmp_path / "none"}"']))
 
 
-def test_changed_masks_are_seen(pictures: Path, tmp_path: Path) -> None:
-    write_mask(tmp_path / "masks" / "view0.png", left_half())
-    config = load_config(overrides=[f'frames.masks="{tmp_path / "masks"}"'])
-    before = mask_inputs(pictures, config)
-    write_mask(tmp_path / "masks" / "view0.png", ~left_half())
-    assert mask_inputs(pictures, config) != before
-    assert mask_inputs(pictures, load_config()) is None
-
-
 # who keeps clear ------------------------------------------------------------------------------------------------
 
 
@@ -175,10 +166,6 @@ def test_stand_ins_of_the_networks_find_the_blue_person(stand_ins: ModelStore, p
     found = PeopleFinder(cards, 1).left_out(image)
     assert found[25:75, 45:65].all()
     assert found.mean() < 1.4 * 60 * 30 / found.size
-    inputs = mask_inputs(pictures, load_config())
-    assert inputs is not None
-    assert set(inputs) == {"people"}
-    assert mask_inputs(pictures, load_config(overrides=['frames.people="keep"'])) is None
     model = stand_ins.get("my-person")
     stand_ins.path(model).write_bytes(bytes(model.bytes))
     with pytest.raises(InputError, match="Download it again"):

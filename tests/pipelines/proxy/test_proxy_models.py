@@ -15,7 +15,6 @@ from msgs_slam.formats.errors import DiskFullError, InputError
 from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.networks.download import fetch
 from msgs_slam.pipelines.networks.registry import Model, ModelStore
-from msgs_slam.pipelines.proxy.inputs import left_to_auto
 from msgs_slam.pipelines.proxy.selection import choose_depth
 from msgs_slam.pipelines.read_config import load_config
 
@@ -229,7 +228,6 @@ def test_the_small_depth_network_comes_before_the_large_one_but_for_best(
         assert models.first_here("depth") == model
     names = [choose_depth(load_config(quality=q).proxy).card for q in ("normal", "best")]
     assert [card.name for card in names if card is not None] == ["onnx:metric3d-small", "onnx:metric3d-large"]
-    assert left_to_auto(load_config(quality="best")) == ("depth", "labels")
 
 
 def test_a_model_that_needs_another_is_here_when_both_are(server: tuple[str, Behaviour], tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from proxy_room import Room, write_source
 from tokenizers import Tokenizer, models, normalizers, pre_tokenizers
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.reading import noting_files
 from msgs_slam.formats.tensors import save_arrays
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.engine.stages import StageContext
@@ -23,7 +24,7 @@ from msgs_slam.pipelines.networks.card import read_card
 from msgs_slam.pipelines.networks.labels import network_probabilities
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.networks.words import MAX_WORDS, with_words
-from msgs_slam.pipelines.proxy.inputs import check_proxy, proxy_inputs
+from msgs_slam.pipelines.proxy.inputs import check_proxy
 from msgs_slam.pipelines.proxy.stage import run
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import CLASSES, PROXY_MAPS
@@ -270,17 +271,10 @@ def test_a_table_of_embeddings_says_the_same_as_the_encoder(card: Path) -> None:
     np.testing.assert_allclose(stored.weight, encoded.weight, atol=1e-3)
 
 
-def test_other_words_and_embeddings_are_seen(source: Path, card: Path) -> None:
-    def labels(words: str) -> str:
-        overrides = [f'proxy.semantics="onnx:{card}"', f'proxy.classes="{words}"', "run.device=cpu"]
-        return proxy_inputs(source, load_config(overrides=overrides))["labels"]
-
-    seen = [labels("wall"), labels("wall, floor")]
-    (card.parent / "tokenizer.json").write_text("{}")
-    seen.append(labels("wall"))
-    write_table(card.parent / "text.onnx")
-    seen.append(labels("wall"))
-    assert len(set(seen)) == 4
+def test_all_that_a_network_loads_is_noted(card: Path) -> None:
+    with noting_files() as files:
+        Network(with_words(read_card(card), "wall"), 1, "cpu")
+    assert {*files} == {card, *(card.parent / name for name in ("net.onnx", "text.onnx", "tokenizer.json"))}
 
 
 def test_the_option_needs_a_network_that_knows_words(source: Path, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from msgs_slam.formats.textfile import MAX_JSON_BYTES, read_json
 from msgs_slam.pipelines.config import Config, ExportConfig
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings
 from msgs_slam.pipelines.run.manifest import Manifest, Source, StageRecord, write_manifest
+from msgs_slam.pipelines.run.reads import Reads
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 
@@ -23,7 +24,7 @@ def test_a_large_manifest_is_read_again(tmp_path: Path) -> None:
     files = {f"correspondence/{n:0240d}.npz": (n, f"{n:064x}") for n in range(100_000)}
     run = RunFolder(tmp_path)
     write_manifest(
-        run.manifest_file, Manifest(Source("v", "d"), {"frames": StageRecord("f", files, 1, 1, {}, [], "c")})
+        run.manifest_file, Manifest(Source("v", "d"), {"frames": StageRecord(Reads(), files, 1, 1, {}, [], "c")})
     )
     assert run.manifest_file.stat().st_size > MAX_JSON_BYTES
     assert load_records(run)["frames"].files == files
@@ -93,9 +94,9 @@ def test_a_setting_that_is_no_more_does_not_stop_a_run(run: RunFolder, caplog: p
 
 def test_a_manifest_of_another_format_is_refused(run: RunFolder) -> None:
     value = json.loads(run.manifest_file.read_text())
-    for format in (1, 99):
+    for format in (1, 2, 99):
         run.manifest_file.write_text(json.dumps(value | {"format": format}))
-        with pytest.raises(InputError, match=f"its format is {format}, this version of the program knows 2"):
+        with pytest.raises(InputError, match=f"its format is {format}, this version of the program knows 3"):
             load_records(RunFolder(run.root))
 
 

@@ -13,6 +13,7 @@ from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.run.ending import move_in, results, seal, unseal
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.manifest import StageRecord
+from msgs_slam.pipelines.run.reads import Reads
 from msgs_slam.pipelines.run.target import LIST, STAGE, Target, Written, keep_others, read_list, write_list
 
 
@@ -163,7 +164,7 @@ def test_the_folder_of_the_export_is_replaced_around_what_is_not_its_own(
         for name in names:
             write_text(run.partial("export") / name, " ".join(names))
         files = results(run.partial("export"))
-        seal(run.partial("export"), StageRecord("", files, 1.0, 1.0, {}, [], ""))
+        seal(run.partial("export"), StageRecord(Reads(), files, 1.0, 1.0, {}, [], ""))
         move_in(run, "export")
         unseal(run, "export")
 
