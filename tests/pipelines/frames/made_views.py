@@ -12,9 +12,11 @@ from scipy.spatial.transform import Rotation
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import align_points
+from msgs_slam.pipelines.sfm.bundle import Bundle
 from msgs_slam.pipelines.sfm.candidates import KeyframeSet
 from msgs_slam.pipelines.sfm.driver import StructureFromMotion
 from msgs_slam.pipelines.sfm.flow import Picture
+from msgs_slam.pipelines.sfm.given import bare_model
 from msgs_slam.pipelines.sfm.matching import VerifiedPair, verify_matches
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
 from msgs_slam.pipelines.system.parallel import LruSequence
@@ -127,3 +129,17 @@ def structure_of(made: MadeViews, camera: pycolmap.Camera, folder: Path, **named
         time=lambda k: 10.0 * k, match=lambda *_: np.zeros((0, 2), np.uint32), snapshots=Snapshots(folder),
         progress=SilentProgress(), threads=1, seed=0, **arguments,
     )  # fmt: skip
+
+
+def model_of_bundle(bundle: Bundle, camera: pycolmap.Camera) -> tuple[pycolmap.Reconstruction, list[Array]]:
+    """The bundle as structure from motion would have it; pixels by keyframe."""
+    pixels = [bundle.obs_xy[bundle.obs_cam == k] for k in range(len(bundle.cam_from_world))]
+    tracks: list[list[pycolmap.TrackElement]] = [[] for _ in bundle.points]
+    for k in range(len(pixels)):
+        for n, p in enumerate(bundle.obs_point[bundle.obs_cam == k]):
+            tracks[p].append(pycolmap.TrackElement(k + 1, n))
+    model = bare_model(camera, pixels, bundle.cam_from_world)
+    for xyz, elements in zip(bundle.points, tracks, strict=True):
+        if len(elements) >= 2:
+            model.add_point3D(xyz, pycolmap.Track(elements), np.zeros(3, np.uint8))
+    return model, pixels

@@ -9,10 +9,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from msgs_slam.formats.datasets.sequence import Camera
 from msgs_slam.pipelines.frames.findings import warn_of_focal
 from msgs_slam.pipelines.sfm import two_views
-from msgs_slam.pipelines.sfm.lens import to_pycolmap, unknown_camera
+from msgs_slam.pipelines.sfm.lens import unknown_camera
 from msgs_slam.pipelines.sfm.two_views import _errors, _rotation, calibrated, two_view_lens
 from tests.pipelines.frames.made_views import MadeViews, structure_of, walk_round
 
@@ -20,9 +19,15 @@ SIZE = (640, 480)
 GUESS = unknown_camera(*SIZE, 768.0, is_prior=False)
 
 
+def camera_of(focal: float, k1: float = 0.0) -> pycolmap.Camera:
+    camera = unknown_camera(*SIZE, focal, is_prior=True)
+    camera.params = [focal, 320.0, 240.0, k1]
+    return camera
+
+
 @pytest.mark.parametrize("focal", [330.0, 520.0, 1100.0])
 def test_the_focal_length_is_found_without_poses(focal: float) -> None:
-    made = walk_round(to_pycolmap(Camera(*SIZE, focal, focal, 320.0, 240.0)))
+    made = walk_round(camera_of(focal))
     pairs, xy = made.pairs(GUESS), [f.xy for f in made.features]
     found, bend = two_view_lens(pairs, xy, SIZE) or (0.0, 1.0)
     assert found == pytest.approx(focal, rel=0.06)
@@ -42,7 +47,7 @@ def test_the_focal_length_is_found_without_poses(focal: float) -> None:
 
 
 def test_false_pairs_do_not_turn_it() -> None:
-    made = walk_round(to_pycolmap(Camera(*SIZE, 520.0, 520.0, 320.0, 240.0)))
+    made = walk_round(camera_of(520.0))
     pairs, xy, rng = made.pairs(GUESS), [f.xy for f in made.features], np.random.default_rng(0)
     false = [
         replace(p, matches=np.column_stack([p.matches[:, 0], rng.permutation(p.matches[:, 1])])) for p in pairs[::4]
@@ -53,9 +58,7 @@ def test_false_pairs_do_not_turn_it() -> None:
 @pytest.mark.parametrize(("focal", "k1"), [(512.0, -0.1), (384.0, -0.2), (384.0, -0.3), (512.0, 0.1)])
 def test_a_lens_that_bends_keeps_its_matches(focal: float, k1: float) -> None:
     """Up to 40 % of them contradict a pinhole."""
-    camera = unknown_camera(*SIZE, focal, is_prior=True)
-    camera.params = [focal, 320.0, 240.0, k1]
-    made = walk_round(camera, 16)
+    made = walk_round(camera_of(focal, k1), 16)
     pairs, xy = made.pairs(GUESS), [f.xy for f in made.features]
     found, posed = calibrated(GUESS, pairs, xy)
     assert found.params[3] / k1 > 0.4
@@ -65,9 +68,7 @@ def test_a_lens_that_bends_keeps_its_matches(focal: float, k1: float) -> None:
 
 @pytest.mark.parametrize(("focal", "k1"), [(512.0, 0.0), (384.0, -0.2), (384.0, -0.3), (512.0, 0.1)])
 def test_the_lens_of_a_path_is_found_and_none_where_there_is_none(focal: float, k1: float, tmp_path: Path) -> None:
-    camera = unknown_camera(*SIZE, focal, is_prior=True)
-    camera.params = [focal, 320.0, 240.0, k1]
-    made = walk_round(camera, 16)
+    made = walk_round(camera_of(focal, k1), 16)
     structure = structure_of(made, GUESS, tmp_path, is_fixed=False)
     found = structure._calibrated(made.views(), made.pairs(GUESS))
     assert found is not None
@@ -79,7 +80,7 @@ def test_the_lens_of_a_path_is_found_and_none_where_there_is_none(focal: float, 
 
 
 def test_a_bad_start_from_pairs_is_not_the_last_word(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = walk_round(to_pycolmap(Camera(*SIZE, 520.0, 520.0, 320.0, 240.0)), 16)
+    made = walk_round(camera_of(520.0), 16)
     monkeypatch.setattr(two_views, "two_view_lens", lambda *_: (2.5 * 520.0, 0.0))
     found = structure_of(made, GUESS, tmp_path, is_fixed=False)._calibrated(made.views(), made.pairs(GUESS))
     assert found is not None
@@ -125,7 +126,7 @@ def told_of(made: MadeViews, prior: pycolmap.Camera, origin: str, folder: Path) 
 
 @pytest.mark.parametrize("last", [520.0, 580.0])
 def test_a_zoom_is_noticed_and_a_walk_without_one_is_not_called_so(last: float, tmp_path: Path) -> None:
-    first, second = (walk_round(to_pycolmap(Camera(*SIZE, f, f, 320.0, 240.0)), 16) for f in (520.0, last))
+    first, second = (walk_round(camera_of(f), 16) for f in (520.0, last))
     made = replace(first, features=first.features[:8] + second.features[8:], seen=first.seen[:8] + second.seen[8:])
     origin, said = told_of(made, GUESS, "self-calibrated", tmp_path)
     assert origin == "self-calibrated"
@@ -138,7 +139,7 @@ def test_a_zoom_is_noticed_and_a_walk_without_one_is_not_called_so(last: float, 
 @pytest.mark.parametrize("origin", ["exif", "given"])
 @pytest.mark.parametrize("stated", [520.0, 600.0])
 def test_a_known_focal_length_far_from_the_images_is_said_to_be(origin: str, stated: float, tmp_path: Path) -> None:
-    made = walk_round(to_pycolmap(Camera(*SIZE, 520.0, 520.0, 320.0, 240.0)), 16)
+    made = walk_round(camera_of(520.0), 16)
     prior = unknown_camera(*SIZE, stated, is_prior=True)
     final, said = told_of(made, prior, origin, tmp_path)
     if stated == 520:

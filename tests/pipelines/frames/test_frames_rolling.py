@@ -28,6 +28,7 @@ from msgs_slam.pipelines.sfm.rolling import (
 from msgs_slam.pipelines.tracking.adjust import adjust_state
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
+from tests.pipelines.frames.made_views import model_of_bundle
 from tests.world.clip import ROWS, ClipOptions, make_world, render_frame, render_view, walk
 from tests.world.paths import look_at
 
@@ -65,23 +66,8 @@ def seen_by(readout: float) -> tuple[Bundle, Array]:
 
 
 def as_model(bundle: Bundle) -> tuple[pycolmap.Reconstruction, list[Array]]:
-    """The bundle as structure from motion would have it, its camera's focal length a little off; pixels by keyframe."""
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(unknown_camera(CAMERA.width, CAMERA.height, 505.0, is_prior=True))
-    tracks: list[list[pycolmap.TrackElement]] = [[] for _ in bundle.points]
-    pixels = []
-    for k, pose in enumerate(bundle.cam_from_world):
-        mine = np.flatnonzero(bundle.obs_cam == k)
-        pixels.append(bundle.obs_xy[mine])
-        seen = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in bundle.obs_xy[mine]])
-        image = pycolmap.Image(name=f"{k}", points2D=seen, camera_id=1, image_id=k + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
-        for n, p in enumerate(bundle.obs_point[mine]):
-            tracks[p].append(pycolmap.TrackElement(k + 1, n))
-    for xyz, elements in zip(bundle.points, tracks, strict=True):
-        if len(elements) >= 2:
-            model.add_point3D(xyz, pycolmap.Track(elements), np.zeros(3, np.uint8))
-    return model, pixels
+    """`model_of_bundle` with a camera whose focal length is a little off."""
+    return model_of_bundle(bundle, unknown_camera(CAMERA.width, CAMERA.height, 505.0, is_prior=True))
 
 
 def off_by(cam_from_world: Array) -> float:
@@ -134,12 +120,7 @@ def test_model_is_adjusted_with_the_readout_and_keeps_its_pixels() -> None:
     assert readout[0] == 0
     assert readout[1] == pytest.approx(READOUT, rel=0.03)
     assert found.cameras[1].focal_length == pytest.approx(CAMERA.fx, abs=3 * focal_sd)
-    before, after = (
-        off_by(
-            np.array([np.vstack([m.images[i].cam_from_world().matrix(), [0, 0, 0, 1]]) for i in range(1, COUNT + 1)])
-        )
-        for m in (model, found)
-    )
+    before, after = (off_by(poses_of(m)) for m in (model, found))
     assert 0 < after < 0.25 * before
     kept = [k for k, p in enumerate(found.images[3].points2D) if p.has_point3D()]
     assert np.array_equal([found.images[3].points2D[k].xy for k in kept], pixels[2][kept])

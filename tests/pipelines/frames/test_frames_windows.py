@@ -81,6 +81,13 @@ def model_of(window: range, move: Similarity, noise: float) -> tuple[pycolmap.Re
     return model, [np.array([xy for _, xy in views[k]]) for k in range(COUNT)]
 
 
+def off_by(model: pycolmap.Reconstruction) -> Array:
+    """(N,) distances of the camera centres from the true ones, after Sim(3)."""
+    found = np.array([model.images[i].projection_center() for i in range(1, COUNT + 1)])
+    wanted = se3.inverse(path())[:, :3, 3]
+    return np.linalg.norm(align_points(found, wanted).apply(found) - wanted, axis=1)
+
+
 def moves() -> list[Similarity]:
     turns = se3.exp(np.array([[0, 0, 0, 0, 0, 0], [1, 2, 3, 0.3, -0.5, 1.0], [-5, 0, 1, 2.0, 0.1, 0.2]]))
     return [Similarity(s, t[:3, :3], t[:3, 3]) for s, t in zip((1.0, 0.4, 2.5), turns, strict=True)]
@@ -119,9 +126,7 @@ def test_windows_of_three_worlds_become_one_model() -> None:
     assert twice <= whole.num_points3D() <= 1.05 * twice  # what leaves the picture and comes back is two points
     adjust_together(whole, xy, np.arange(COUNT) / 10, NO_READOUT)
     assert sorted(whole.reg_image_ids()) == list(range(1, COUNT + 1))
-    found = np.array([whole.images[i].projection_center() for i in range(1, COUNT + 1)])
-    wanted = se3.inverse(path())[:, :3, 3]
-    assert np.linalg.norm(align_points(found, wanted).apply(found) - wanted, axis=1).max() < 0.01
+    assert off_by(whole).max() < 0.01
     assert float(np.median(model_errors(whole))) == pytest.approx(0.55, abs=0.1)
 
 
@@ -202,9 +207,7 @@ def test_a_path_that_lost_its_size_is_mended_by_what_matches(ratio: float) -> No
     assert count > 100
     whole, better = repair_scale_breaks(model, report, pairs, xy, COUNT, 4, 0)
     assert [len(p) for p in better.parts] == [COUNT]
-    centers = np.array([whole.images[i].projection_center() for i in range(1, COUNT + 1)])
-    wanted = se3.inverse(path())[:, :3, 3]
-    assert np.linalg.norm(align_points(centers, wanted).apply(centers) - wanted, axis=1).max() < 0.02
+    assert off_by(whole).max() < 0.02
 
 
 def test_a_path_that_nothing_holds_stays_in_parts() -> None:
@@ -226,12 +229,11 @@ def test_points_a_pixel_off_have_no_say_in_a_narrow_adjustment() -> None:
         off = np.where(rng.random((len(view), 1)) < 1 / 6, rng.uniform([0.5, 0], [2, 1e-9], (len(view), 2)), 0.0)
         for point, at in zip(model.images[k].points2D, exact + off + rng.normal(0, 0.05, off.shape), strict=True):
             point.xy = at
-    wanted, errors = se3.inverse(path())[:, :3, 3], []
+    errors = []
     for narrowly in (False, True):
         tried = pycolmap.Reconstruction(model)
         adjust_model(tried, refine_camera=False, narrowly=narrowly)
-        found = np.array([tried.images[i].projection_center() for i in range(1, COUNT + 1)])
-        errors.append(np.linalg.norm(align_points(found, wanted).apply(found) - wanted, axis=1).mean())
+        errors.append(off_by(tried).mean())
     assert errors[1] < 0.5 * errors[0]
 
 

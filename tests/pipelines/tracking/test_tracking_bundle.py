@@ -19,7 +19,7 @@ from msgs_slam.pipelines.tracking.adjust import adjust_state, consistent, drop_l
 from msgs_slam.pipelines.tracking.pnp import colmap_camera
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
-from tests.pipelines.frames.made_views import walk_along_bare_wall
+from tests.pipelines.frames.made_views import model_of_bundle, walk_along_bare_wall
 from tests.pipelines.frames.test_frames_given import CAMERA
 from tests.pipelines.tracking.conftest import KnownBundle
 
@@ -199,7 +199,9 @@ def test_reaches_the_minimum_of_ceres(known_bundle: KnownBundle, monkeypatch: py
     monkeypatch.setattr("msgs_slam.pipelines.sfm.bundle._MIN_GAIN", 1e-12)
     bundle, intrinsics = without_depth(known_bundle.bundle), known_bundle.intrinsics
     ours = adjust_bundle(bundle, intrinsics, 100, width=1e6)
-    reconstruction = to_colmap(bundle, intrinsics)
+    camera = colmap_camera(intrinsics)
+    camera.camera_id = 1
+    reconstruction, _ = model_of_bundle(bundle, camera)
     options = pycolmap.BundleAdjustmentOptions(
         refine_focal_length=False, refine_principal_point=False, refine_extra_params=False, print_summary=False
     )
@@ -212,23 +214,6 @@ def test_reaches_the_minimum_of_ceres(known_bundle: KnownBundle, monkeypatch: py
     xy = (in_cam + poses[bundle.obs_cam, :3, 3]) @ intrinsics.matrix.T
     ceres_cost = (((xy[:, :2] / xy[:, 2:] - bundle.obs_xy) / 0.5) ** 2).sum()
     assert ours.cost == pytest.approx(ceres_cost, rel=1e-4)
-
-
-def to_colmap(bundle: Bundle, intrinsics: Intrinsics) -> pycolmap.Reconstruction:
-    reconstruction = pycolmap.Reconstruction()
-    camera = colmap_camera(intrinsics)
-    camera.camera_id = 1
-    reconstruction.add_camera_with_trivial_rig(camera)
-    for c, pose in enumerate(bundle.cam_from_world):
-        mine = np.flatnonzero(bundle.obs_cam == c)
-        image = pycolmap.Image(name=str(c), keypoints=bundle.obs_xy[mine], camera_id=1, image_id=c + 1)
-        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
-    for p, xyz in enumerate(bundle.points):
-        track = pycolmap.Track()
-        for c in range(len(bundle.cam_from_world)):
-            track.add_element(c + 1, p)
-        reconstruction.add_point3D(xyz, track, np.zeros(3, np.uint8))
-    return reconstruction
 
 
 def test_motion_only_adjustment_finds_the_pose(known_bundle: KnownBundle) -> None:
