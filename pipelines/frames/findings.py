@@ -113,18 +113,18 @@ def warn_of_structure(context: StageContext, structure: Structure, ids: list[int
             f"{len(inside)} of them, frames {inside[0]}-{inside[-1]}, are consistent with each other: unless tracking "
             "connects them, they become a separate piece"
         )
-    parts = [p for p in report.parts if len(p) >= _MIN_PART]
-    if len(parts) > 1:
-        named = ", ".join(f"{ids[p[0]]}-{ids[p[-1]]}" for p in parts)
+    components = [p for p in report.components if len(p) >= _MIN_PART]
+    if len(components) > 1:
+        named = ", ".join(f"{ids[p[0]]}-{ids[p[-1]]}" for p in components)
         context.warn(
-            f"structure from motion gave {len(parts)} disconnected parts (frames {named}): "
+            f"structure from motion gave {len(components)} disconnected components (frames {named}): "
             "tracking joins those it recognises"
         )
-    alone = sorted(ids[k] for p in report.parts if len(p) < _MIN_PART for k in p)
-    if alone:
+    small = sorted(ids[k] for p in report.components if len(p) < _MIN_PART for k in p)
+    if small:
         context.warn(
-            f"{len(alone)} keyframes share hardly any points with the others (frames "
-            f"{', '.join(map(str, alone))}): tracking searches for them again"
+            f"{len(small)} keyframes share hardly any points with the others (frames "
+            f"{', '.join(map(str, small))}): tracking searches for them again"
         )
     folds = ", ".join(f"{ids[s.before]}-{ids[s.after]}" for s in report.contradicted)
     agreeing = f"{report.pairs_agreeing:.0%} of the matched pairs of views agree with it (mapper: {structure.mapper})"

@@ -301,7 +301,7 @@ def _figures(frames: list[Frame], structure: Structure, calibration: Calibration
         "points": report.points,
         "reprojection_px": round(report.reprojection_px, 4),
         "pairs_agreeing": round(report.pairs_agreeing, 4),
-        "parts": len(report.parts),
+        "parts": len(report.components),
         "contradicted_seams": len(report.contradicted),
         "scale_drift": round(report.drift.factor, 3),
         "mapper": structure.mapper,

@@ -1,4 +1,4 @@
-"""What holds the parts of a path together: matches, shared points, and the covariance of an adjustment.
+"""What holds the components of a path together: matches, shared points, and the covariance of an adjustment.
 
 The share of agreeing pairs over a whole model hides one bad place among hundreds of good ones: a seam looks only at
 what crosses between one keyframe and the next. Nor do reprojection errors tell whether poses are determined.
@@ -144,8 +144,8 @@ def remove_keyframes(model: pycolmap.Reconstruction, keyframes: Iterable[int]) -
 def find_components(
     placed: Sequence[int], seams: Iterable[Seam], tracks: Iterable[Sequence[int]], reach: int
 ) -> list[list[int]]:
-    """Placed keyframes in parts, largest first: runs between loose seams, joined where a loop, what is seen again more
-    than `reach` places later, holds them together."""
+    """Divide placed keyframes into components, largest first: runs between loose seams, joined where a loop, what is
+    seen again more than `reach` places later, holds them together."""
     place = {k: n for n, k in enumerate(placed)}
     loose = {s.after for s in seams if s.is_weak_link}
     run = np.cumsum([k in loose for k in placed], dtype=np.int64).tolist()
@@ -158,10 +158,10 @@ def find_components(
     label = list(range(number + 1))
     for a, b in np.argwhere(np.triu(shared, 1) >= 2 * MIN_POINTS).tolist():
         label = [label[a] if x == label[b] else x for x in label]
-    parts: dict[int, list[int]] = {}
+    components: dict[int, list[int]] = {}
     for k in placed:
-        parts.setdefault(label[run[place[k]]], []).append(k)
-    return sorted(parts.values(), key=lambda p: (-len(p), p[0]))
+        components.setdefault(label[run[place[k]]], []).append(k)
+    return sorted(components.values(), key=lambda p: (-len(p), p[0]))
 
 
 def components_of(model: pycolmap.Reconstruction, total: int, reach: int) -> list[list[int]]:
@@ -175,13 +175,12 @@ def tracks_of(model: pycolmap.Reconstruction, total: int) -> list[list[int]]:
     return [sorted({(e.image_id - 1) % total for e in p.track.elements}) for p in model.points3D.values()]
 
 
-def cut(model: pycolmap.Reconstruction, parts: Sequence[Sequence[int]], total: int) -> None:
-    """Take the observations away by which a point is seen from more than one part of the places, in place; the larger
-    part keeps it."""
-    part = {k: n for n, members in enumerate(parts) for k in members}
+def cut(model: pycolmap.Reconstruction, components: Sequence[Sequence[int]], total: int) -> None:
+    """Remove, in place, observations by which a point is seen from more than one component; the larger one keeps it."""
+    component = {k: n for n, members in enumerate(components) for k in members}
     for point_id in sorted(model.point3D_ids()):
         elements = model.points3D[point_id].track.elements
-        owners = [part[(e.image_id - 1) % total] for e in elements]
+        owners = [component[(e.image_id - 1) % total] for e in elements]
         keeper = min(set(owners), key=lambda o: (-owners.count(o), o))
         stray = [(e.image_id, e.point2D_idx) for e, o in zip(elements, owners, strict=True) if o != keeper]
         for image_id, index in stray:
@@ -193,16 +192,15 @@ def cut(model: pycolmap.Reconstruction, parts: Sequence[Sequence[int]], total: i
 
 
 def undetermined_cameras(
-    bundle: Bundle, intrinsics: Intrinsics, parts: Iterable[Sequence[int]], least: int, counted: Container[int]
+    bundle: Bundle, intrinsics: Intrinsics, components: Iterable[Sequence[int]], least: int, counted: Container[int]
 ) -> tuple[list[int], list[list[int]]]:
-    """Indices of the cameras that the images do not determine against most of their part, in groups of fewer than
-    `least` of those `counted`; and the larger groups beside the largest of a part. `parts` are cameras that share no
-    point with those of another. Where no group has most of a part, nothing is better known than the rest: what is
-    beside its largest group counts as one larger group."""
+    """List the cameras that the images do not determine against most of their component, in groups of fewer than
+    `least` of those `counted`; and the larger groups beside the largest of a component. Where no group has most of it,
+    nothing is better known than the rest: what is beside its largest group counts as one larger group."""
     loose: list[int] = []
     apart: list[list[int]] = []
-    for part in parts:
-        members = np.array(sorted(part), np.int64)
+    for component in components:
+        members = np.array(sorted(component), np.int64)
         largest, *groups = pose_groups(_part(bundle, members), intrinsics)
         if 2 * len(largest) <= len(members):
             apart.append(members[sorted(k for group in groups for k in group)].tolist())

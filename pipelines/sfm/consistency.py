@@ -66,7 +66,7 @@ class ModelReport:
 
     `agreement`: share of the verified matches between registered keyframes that are within 4 px of the epipolar line
     of the final poses; `pairs_agreeing`: share of the pairs of which more than half of the matches do. A folded
-    trajectory leaves whole pairs that disagree, however small its reprojection error is. `seams` and `parts`: see
+    trajectory leaves whole pairs that disagree, however small its reprojection error is. `seams` and `components`: see
     `find_seams` and `find_components`; they see one bad place among many good ones. `drift`: see `scale_drift`.
     """
 
@@ -77,13 +77,13 @@ class ModelReport:
     agreement: float
     pairs_agreeing: float
     seams: tuple[Seam, ...]
-    parts: tuple[tuple[int, ...], ...]
+    components: tuple[tuple[int, ...], ...]
     drift: ScaleDrift = NO_DRIFT
 
     @property
     def largest(self) -> tuple[int, ...]:
         """The part with most keyframes; empty where nothing is placed."""
-        return self.parts[0] if self.parts else ()
+        return self.components[0] if self.components else ()
 
     @property
     def contradicted(self) -> list[Seam]:
@@ -129,11 +129,11 @@ def judge(
     matches, agreeing = sum(c.matches for c in checks), sum(c.agreeing for c in checks)
     placed, tracks = sorted({(i - 1) % total for i in model.reg_image_ids()}), tracks_of(model, total)
     seams = find_seams(placed, checks, tracks, reach)
-    parts = find_components(placed, seams, tracks, reach)
+    components = find_components(placed, seams, tracks, reach)
     return ModelReport(
         len(placed), total, model.num_points3D(), median_error(model),
         agreeing / max(matches, 1), sum(c.agrees for c in checks) / max(len(checks), 1),
-        tuple(seams), tuple(map(tuple, parts)), scale_drift(model, pairs, xy, total, reach),
+        tuple(seams), tuple(map(tuple, components)), scale_drift(model, pairs, xy, total, reach),
     )  # fmt: skip
 
 

@@ -52,7 +52,7 @@ def no_prefetch(name: str, count: int, known: dict[str, NDArray]) -> None:
 class Structure:
     """An adjusted reconstruction (image i + 1 is keyframe i, all cameras are as camera 1) and how good it is.
 
-    No point is seen from two of the report's parts: the transform between them is unknown. `tried` are the pairs
+    No point is seen from two of the report's components: the transform between them is unknown. `tried` are the pairs
     of keyframes that were matched, `pairs` those of them that obey one geometry. `pieces` are further models, in the
     same camera, of keyframes that the ones before could not place, each with a world and a unit of its own.
     `loose` were left out again: see `undetermined_cameras`.
@@ -111,7 +111,7 @@ class StructureFromMotion(CandidateModels):
         if found is None:
             raise InputError(why_no_structure(len(features), pairs))
         found, pieces = self._largest_first(found, self._pieces(views, pairs, found.model, apart), views)
-        report, loose = self._in_parts(found.model, views, pairs)
+        report, loose = self._divided(found.model, views, pairs)
         straight = rectified_features(found.model, views.xy, views.times, found.readout)
         drift = scale_drift(found.model, pairs, straight, self._places(views.xy), self.config.overlap)
         report = replace(report, drift=drift)
@@ -120,14 +120,14 @@ class StructureFromMotion(CandidateModels):
             found.readout, loose,
         )  # fmt: skip
 
-    def _in_parts(
+    def _divided(
         self, model: pycolmap.Reconstruction, views: KeyframeSet, pairs: Sequence[VerifiedPair]
     ) -> tuple[ModelReport, list[int]]:
-        """The report on a model, whose parts share no point from now on, and the loose keyframes it is now without."""
+        """Report on a model, cut into components that share no point, and list the loose keyframes taken out of it."""
         loose: list[int] = []
         while True:
             report = judge(model, pairs, views.xy, self._places(views.xy), self.config.overlap)
-            cut(model, report.parts, report.total)
+            cut(model, report.components, report.total)
             found = [] if loose else self._loose(model, views, report)
             if not found:
                 return report, loose
@@ -141,8 +141,8 @@ class StructureFromMotion(CandidateModels):
         rolling = RollingModel(model, views.xy, views.times)
         bundle, _, pinhole = rolling.bundle()
         number = {i - 1: n for n, i in enumerate(rolling.images)}
-        parts = [[number[k] for k in part] for part in report.parts]
-        loose, _ = undetermined_cameras(bundle, pinhole, parts, self.config.least_piece, range(len(number)))
+        components = [[number[k] for k in component] for component in report.components]
+        loose, _ = undetermined_cameras(bundle, pinhole, components, self.config.least_piece, range(len(number)))
         return [rolling.images[n] - 1 for n in loose]
 
     def _as_given(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> AdjustedModel | None:
@@ -260,7 +260,7 @@ class StructureFromMotion(CandidateModels):
             report = judge(piece, rest, views.xy, self._places(views.xy), self.config.overlap)
             left -= {i - 1 for i in piece.reg_image_ids()}
             if self._is_piece(report):
-                remove_keyframes(piece, [k for part in report.parts[1:] for k in part])
+                remove_keyframes(piece, [k for component in report.components[1:] for k in component])
                 pieces.append(piece)
         return pieces
 

@@ -191,11 +191,11 @@ def adjust_together(
 
 @dataclass
 class WindowModels:
-    """`parts`: the windows joined one to the next; where one has no model, or shares too little with the one before, a
-    new part begins. For each window its camera's parameters (P,), the standard deviation of the focal length, the
-    readout and the number of observations."""
+    """`components`: the windows joined one to the next; where one has no model, or shares too little with the one
+    before, a new one begins. For each window its camera's parameters (P,), the standard deviation of the focal length,
+    the readout and the number of observations."""
 
-    parts: list[Joined] = field(default_factory=list)
+    components: list[Joined] = field(default_factory=list)
     cameras: list[Array] = field(default_factory=list)
     focal_sds: list[float] = field(default_factory=list)
     readouts: list[Readout] = field(default_factory=list)
@@ -203,9 +203,9 @@ class WindowModels:
 
     def add(self, model: pycolmap.Reconstruction, first: int, focal_sd: float, readout: Readout) -> None:
         """Add the model of the next window, whose images are counted from `first`."""
-        if not self.parts or not self.parts[-1].add(model, first):
-            self.parts.append(Joined())
-            self.parts[-1].add(model, first)
+        if not self.components or not self.components[-1].add(model, first):
+            self.components.append(Joined())
+            self.components[-1].add(model, first)
         self.cameras.append(np.array(model.cameras[1].params))
         self.focal_sds.append(focal_sd)
         self.readouts.append(readout)
@@ -228,28 +228,28 @@ class WindowModels:
     def complaint(self, windows: int) -> str:
         """Return a warning about what has not become one model, "" where everything has."""
         failed = windows - len(self.cameras)
-        if len(self.parts) == 1 and not failed:
+        if len(self.components) == 1 and not failed:
             return ""
         return (
             f"structure from motion of a long recording in {windows} windows: {failed} gave no model, and the others "
-            f"form {len(self.parts)} disconnected components. The largest is the run, others become pieces. A larger "
-            "run.memory_mb makes windows larger, up to 500 keyframes"
+            f"form {len(self.components)} disconnected components. The largest is the run, others become pieces. A "
+            "larger run.memory_mb makes windows larger, up to 500 keyframes"
         )
 
     def largest(self) -> Joined:
         """Return the part with most keyframes, the first of equal ones."""
-        return max(self.parts, key=lambda part: len(part.poses))
+        return max(self.components, key=lambda component: len(component.poses))
 
     def others(
         self, camera: pycolmap.Camera, xy: Sequence[Array], whole: pycolmap.Reconstruction, least: int
     ) -> list[pycolmap.Reconstruction]:
-        """Return the other parts with at least `least` keyframes that `whole` does not have, without those it has."""
+        """Return the other components with at least `least` keyframes that `whole` lacks, without those it has."""
         found, placed = [], set(whole.reg_image_ids())
-        for part in self.parts:
-            if part is not self.largest() and len(part.poses.keys() - placed) >= least:
-                model = part.model(camera, xy)
-                remove_keyframes(model, [i - 1 for i in sorted(part.poses.keys() & placed)])
-                placed |= part.poses.keys()
+        for component in self.components:
+            if component is not self.largest() and len(component.poses.keys() - placed) >= least:
+                model = component.model(camera, xy)
+                remove_keyframes(model, [i - 1 for i in sorted(component.poses.keys() & placed)])
+                placed |= component.poses.keys()
                 found.append(model)
         return found
 
@@ -265,9 +265,9 @@ def repair_scale_breaks(
     total: int, reach: int, seed: int,
 ) -> tuple[pycolmap.Reconstruction, ModelReport]:  # fmt: skip
     """The model with both sides of its weak links at one scale, where enough matched features give it and the result
-    falls into fewer parts without agreeing less; else as it is. Arguments as of `judge`, image i + 1 is keyframe i."""
+    has fewer components without agreeing less; else as it is. Arguments as of `judge`."""
     for seam in [s for s in report.seams if s.is_weak_link]:
-        owner = {k: n for n, part in enumerate(report.parts) for k in part}
+        owner = {k: n for n, component in enumerate(report.components) for k in component}
         if {owner[k] for k in owner if k <= seam.before} & {owner[k] for k in owner if k >= seam.after}:
             continue  # a loop holds the two sides
         for shared in sorted((seam.before, seam.after), key=_ties(model, total, reach)):
@@ -279,12 +279,12 @@ def repair_scale_breaks(
             filter_outliers(tried)
             complete_tracks(tried, pairs, seed)
             # What follows only takes observations away.
-            if len(components_of(tried, total, reach)) >= len(report.parts):
+            if len(components_of(tried, total, reach)) >= len(report.components):
                 continue
             bundle_adjust(tried, sorted(tried.reg_image_ids()), refine_camera=False, roughly=True)
             filter_outliers(tried)
             found = judge(tried, pairs, xy, total, reach)
-            if len(found.parts) < len(report.parts) and found.pairs_agreeing >= report.pairs_agreeing:
+            if len(found.components) < len(report.components) and found.pairs_agreeing >= report.pairs_agreeing:
                 model, report = tried, found
                 break
     return model, report

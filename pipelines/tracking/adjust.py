@@ -118,12 +118,12 @@ def drop_loose(
     ids = report.frame_ids
     if len(state.rig) > 1:  # a panorama sees all around
         return [], []
-    parts: dict[int, list[int]] = {}
+    segments: dict[int, list[int]] = {}
     for k in np.unique(report.bundle.obs_cam).tolist():
-        parts.setdefault(state.segment[ids[k]], []).append(k)
+        segments.setdefault(state.segment[ids[k]], []).append(k)
     keyframes = set(state.keyframes)
     counted = {k for k, i in enumerate(ids) if i in keyframes}
-    found, apart = undetermined_cameras(report.bundle, intrinsics, parts.values(), least, counted)
+    found, apart = undetermined_cameras(report.bundle, intrinsics, segments.values(), least, counted)
     loose = {ids[k] for k in found}
     others = sorted(set(state.poses).difference(ids))
     loose |= {i for i in others if loose and loose.issuperset(state.nearest_keyframes(i, 1))}

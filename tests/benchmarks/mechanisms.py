@@ -140,7 +140,7 @@ def measured(name: str, form: str, off: str, work: Path) -> dict[str, Any]:
     truth = [case.truth(originals[f.id], f.source_index) for f in chosen]
     r, seconds = found.report, time.process_time() - started
     return {
-        "acting": sorted(acting), "placed": r.registered, "of": r.total, "part": len(r.parts[0]),
+        "acting": sorted(acting), "placed": r.registered, "of": r.total, "part": len(r.components[0]),
         "mapper": found.mapper, "agreeing": r.pairs_agreeing, "seconds": seconds, **compare(poses, truth),
         "pieces": [p.num_reg_images() for p in found.pieces],
     }  # fmt: skip

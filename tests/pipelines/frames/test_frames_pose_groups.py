@@ -113,7 +113,7 @@ def test_few_are_loose_and_many_are_a_group_of_their_own(strip: tuple[Bundle, In
 def test_structure_from_motion_leaves_them_out(tmp_path: Path) -> None:
     for made, wanted in ((walk_along_bare_wall(CAMERA), STRIP), (walk_round(CAMERA), [])):
         model = model_of(made)
-        report, loose = structure_of(made, CAMERA, tmp_path)._in_parts(model, made.views(), made.pairs(CAMERA))
+        report, loose = structure_of(made, CAMERA, tmp_path)._divided(model, made.views(), made.pairs(CAMERA))
         assert loose == wanted
         count = len(made.features)
         assert sorted(i - 1 for i in model.reg_image_ids()) == sorted(set(range(count)).difference(wanted))

@@ -149,7 +149,7 @@ def _seam(before: int, points: int = 50, agreement: float = 0.9) -> Seam:
     [
         (9, 0.99, [_seam(0)], [range(9)], [], []),
         (9, 0.99, [_seam(4, agreement=0.1)], [range(9)], [], ["folded between frames 8-10"]),
-        (9, 0.99, [_seam(4, points=0)], [range(5), range(5, 9)], [], ["2 disconnected parts .* 0-8, 10-16"]),
+        (9, 0.99, [_seam(4, points=0)], [range(5), range(5, 9)], [], ["2 disconnected components .* 0-8, 10-16"]),
         (9, 0.99, [_seam(7, points=0)], [range(8), [8]], [], [r"1 keyframes .* \(frames 16\)"]),
         (9, 0.69, [_seam(0)], [range(9)], [], ["far apart contradict .* 69% of the matched pairs"]),
         (6, 0.99, [_seam(5)], [range(3, 9)], [0, 1],

@@ -201,12 +201,12 @@ def torn(at: int, ratio: float) -> tuple[pycolmap.Reconstruction, list[Array], l
 def test_a_path_that_lost_its_size_is_mended_by_what_matches(ratio: float) -> None:
     model, xy, pairs = torn(20, ratio)
     report = judge(model, pairs, xy, COUNT, 4)
-    assert sorted(len(p) for p in report.parts) in ([20, 20], [19, 21])  # the shared keyframe goes with either
+    assert sorted(len(p) for p in report.components) in ([20, 20], [19, 21])  # the shared keyframe goes with either
     found, count = scale_ratio(model, 20, pairs, xy, 4)
     assert found == pytest.approx(1 / ratio, rel=0.02)
     assert count > 100
     whole, better = repair_scale_breaks(model, report, pairs, xy, COUNT, 4, 0)
-    assert [len(p) for p in better.parts] == [COUNT]
+    assert [len(p) for p in better.components] == [COUNT]
     assert off_by(whole).max() < 0.02
 
 
@@ -217,7 +217,7 @@ def test_a_path_that_nothing_holds_stays_in_parts() -> None:
     left, same = repair_scale_breaks(model, report, apart, xy, COUNT, 4, 0)
     assert left is model
     assert same is report
-    assert len(report.parts) > 1
+    assert len(report.components) > 1
 
 
 def test_points_a_pixel_off_have_no_say_in_a_narrow_adjustment() -> None:
