@@ -39,7 +39,7 @@ class RayCluster:
         gpus: GPUs of each task.
         show_prints: whether what tasks print is shown.
 
-    Raises InputError where Ray is not installed, or none answers.
+    Raises InputError where Ray is not installed, none answers, or no node has room for a task.
     """
 
     def __init__(self, address: str = "", threads: int = 0, gpus: int = 0, show_prints: bool = True) -> None:
@@ -53,9 +53,16 @@ class RayCluster:
                 f"no Ray cluster could be joined at {address or 'this machine'} ({str(error)[:300]}). Start one with "
                 "`ray start --head`, with the same versions of Python and Ray on every node, or omit --address"
             ) from error
-        cpus = [int(node["Resources"].get("CPU", 0)) for node in self._ray.nodes() if node["Alive"]]
+        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        cpus = [int(node.get("CPU", 0)) for node in nodes if node.get("GPU", 0) >= gpus]
         self.threads = threads or min((count for count in cpus if count), default=1)
-        self.at_once = max(sum(count // self.threads for count in cpus), 1)
+        self.at_once = sum(count // self.threads for count in cpus)
+        if not self.at_once:  # Ray would wait for such a node for good
+            self.close()
+            raise InputError(
+                f"no node of the Ray cluster has {self.threads} CPUs and {gpus} GPUs: --set run.threads=N and --device "
+                "say how many a task takes"
+            )
         self._task = self._ray.remote(_run_task).options(
             num_cpus=self.threads, num_gpus=gpus, max_retries=RETRIES, retry_exceptions=False
         )

@@ -1,7 +1,6 @@
 """Damage to a finished run: found, named, and never used. `tests/benchmarks/damage.py` tries all of it."""
 
 import json
-import logging
 from collections.abc import Callable
 from pathlib import Path
 
@@ -84,22 +83,6 @@ def test_settings_that_are_gone_are_made_again_from_the_records(copied_run: Call
     (run / "run.toml").unlink()
     assert invoke("resume", run, "-q").exit_code == 0
     assert (run / "run.toml").read_bytes() == before
-
-
-def test_progress_and_errors_as_json_lines(copied_run: Callable[[str], Path]) -> None:
-    run = copied_run("run.msgs")
-    (run / "export" / "mesh.glb").unlink()
-    done = invoke("resume", run, "--log-format", "json", "-v")
-    lines = [json.loads(line) for line in done.stderr.splitlines()]
-    assert {line["event"] for line in lines} >= {"stage", "progress", "log", "result"}
-    ended = [line for line in lines if line.get("ended")]
-    assert {line["label"] for line in ended} >= {"drawing"}
-    assert all(line["done"] == line["total"] for line in ended)
-    (run / "run.toml").write_text("")
-    refused = invoke("resume", run, "--log-format", "json")
-    assert refused.exit_code == 1
-    assert "run.toml is empty" in json.loads(refused.stderr)["message"]
-    logging.getLogger().handlers.clear()
 
 
 def test_lost_frames_of_one_cause_are_told_together() -> None:

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -98,6 +99,15 @@ def test_an_address_without_a_cluster_is_reported_at_once() -> None:
         RayCluster("127.0.0.1:1")
     with pytest.raises(InputError, match="expected HOST:PORT"):
         RayCluster("somewhere")
+
+
+def test_tasks_that_no_node_has_room_for_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes = [{"Alive": True, "Resources": {"CPU": 4.0}}, {"Alive": False, "Resources": {"CPU": 64.0, "GPU": 1.0}}]
+    ray = SimpleNamespace(init=lambda *_, **more: None, nodes=lambda: nodes, shutdown=lambda: None)
+    monkeypatch.setattr(cluster_module, "_import_ray", lambda: ray)
+    for threads, gpus in ((8, 0), (0, 1)):
+        with pytest.raises(InputError, match="no node of the Ray cluster has"):
+            RayCluster(threads=threads, gpus=gpus)
 
 
 def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
