@@ -20,6 +20,7 @@ from ..geometry.camera import project, unproject_depth
 from ..system.jit import kernel
 from ..system.progress import Progress
 from ..types import Intrinsics
+from .still import close_gaps
 
 SIDE = 160
 """Pixels along the long side; all numbers below were chosen with it, on a woman pasted into the keyframes of one room
@@ -204,11 +205,7 @@ def _judge(
 
 def _things(evidence: NDArray[np.bool_], gap: float, before: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
     """(h, w) pieces of evidence that are close together, as things with a rim; with `before` those that touch it."""
-    reach = max(1, round(gap * max(evidence.shape)))
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    around = cv2.copyMakeBorder(evidence.astype(np.uint8), *(reach,) * 4, cv2.BORDER_CONSTANT, value=0)
-    closed = cv2.morphologyEx(around, cv2.MORPH_CLOSE, disc)[reach:-reach, reach:-reach]
-    count, piece, stats, _ = cv2.connectedComponentsWithStats(np.ascontiguousarray(closed))
+    count, piece, stats, _ = cv2.connectedComponentsWithStats(close_gaps(evidence, gap).astype(np.uint8))
     inside = np.bincount(piece.ravel(), evidence.ravel(), count)
     keep = (inside >= _MIN_SHARE * evidence.size) & (inside > _DENSE * stats[:, cv2.CC_STAT_AREA])
     if before is not None:

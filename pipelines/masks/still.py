@@ -69,7 +69,7 @@ def find_still(pictures: Iterable[tuple[NDArray[np.uint8], NDArray[np.bool_] | N
     constant = spread < _CONSTANT
     loose = (presence > _LOOSE) & (strength > (_EDGE / 2) ** 2)
     corners = _corners(gradient, (presence > _FIRM) & (strength > _EDGE**2))
-    veil = float((_parts(loose, _corners(gradient, loose), loose) & ~_closed(constant)).mean())
+    veil = float((_parts(loose, _corners(gradient, loose), loose) & ~close_gaps(constant)).mean())
     if veil > _VEIL:
         return StillPart(_parts(constant, corners, loose), veil)
     return StillPart(_parts(constant | loose, corners, loose))
@@ -154,7 +154,7 @@ def _corners(gradient: NDArray[np.float32], firm: NDArray[np.bool_]) -> NDArray[
 
 def _parts(candidates: NDArray[np.bool_], corners: NDArray[np.bool_], loose: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(h, w) pieces of candidates with enough corners, joined over small gaps, with what they enclose and a margin."""
-    _, piece = cv2.connectedComponents(_closed(candidates).astype(np.uint8))
+    _, piece = cv2.connectedComponents(close_gaps(candidates).astype(np.uint8))
     count, gradients = (np.bincount(piece.ravel(), found.ravel()) for found in (corners, loose))
     kept = (count >= _MIN_CORNERS) & (count > _DENSE * gradients)
     kept[0] = False
@@ -167,8 +167,9 @@ def _parts(candidates: NDArray[np.bool_], corners: NDArray[np.bool_], loose: NDA
     return np.asarray(cv2.dilate((found | small[hole]).astype(np.uint8), _disc(_MARGIN)) > 0)
 
 
-def _closed(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    reach = max(1, round(_GAP * max(mask.shape)))
+def close_gaps(mask: NDArray[np.bool_], gap: float = _GAP) -> NDArray[np.bool_]:
+    """Join the pieces of a mask (h, w) over gaps of at most twice this share of its longer side."""
+    reach = max(1, round(gap * max(mask.shape)))
     around = cv2.copyMakeBorder(mask.astype(np.uint8), *(reach,) * 4, cv2.BORDER_CONSTANT, value=0)
     closed = cv2.morphologyEx(around, cv2.MORPH_CLOSE, _disc(reach))
     return np.asarray(closed[reach:-reach, reach:-reach] > 0)
