@@ -13,7 +13,7 @@ from ..pipelines.config import STAGES, Option, settings_with_options
 
 if TYPE_CHECKING:
     from ..pipelines.config import Config
-    from ..pipelines.engine.cluster import RayCluster
+    from ..pipelines.run.cluster import RayCluster
     from ..pipelines.run.folder import RunFolder
     from .output import Output
 
@@ -75,7 +75,7 @@ def open_cluster(name: str, address: str, config: Config, output: Output) -> Ite
             raise click.UsageError("`--address` needs `--engine ray`")
         yield None
         return
-    from ..pipelines.engine.cluster import RayCluster
+    from ..pipelines.run.cluster import RayCluster
 
     cluster = RayCluster(address, config.run.threads, int(config.run.device == "cuda"), not output.quiet)
     try:
@@ -132,8 +132,8 @@ def chosen_config(
 def use_threads(run: RunFolder | None = None) -> None:
     """Let the libraries of this process use as many CPU threads as the run's settings say, or all that there are: a
     container's share, not its machine's."""
-    from ..pipelines.engine.tasks import limit_threads
     from ..pipelines.run.folder import load_settings
+    from ..pipelines.run.tasks import limit_threads
     from ..pipelines.system.machine import available_cpus
 
     limit_threads((load_settings(run).run.threads if run is not None else 0) or available_cpus())

@@ -37,8 +37,8 @@ from .json_lines import JsonHandler, JsonProgress, write_line
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-    from ..pipelines.engine.status import StageStatus
     from ..pipelines.run.manifest import StageRecord
+    from ..pipelines.run.status import StageStatus
 
 KEY_FIGURES = {
     "frames": ("frames", "keyframes_placed", "calibration", "focal_px", "focal_sd_px", "still_left_out", "gps"),
@@ -327,7 +327,7 @@ def report_run(output: Output, root: Path, records: dict[str, Any]) -> None:
 
 def print_summary(root: Path, records: dict[str, Any]) -> None:
     """Print the table, what is not said yet, and where the results are."""
-    from ..pipelines.engine.status import DONE, StageStatus
+    from ..pipelines.run.status import DONE, StageStatus
 
     say(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
     for line in warning_lines(records, was_shown):

@@ -18,8 +18,8 @@ from .output import Output, on_sigterm, say, verbosity_options
 @click.option("--json", "as_json", is_flag=True, help="The same for programs, with every figure.")
 def status(run_path: Path, verbose: bool, as_json: bool) -> None:
     """Say which stages of RUN are done, what they found, what was degraded, and which files are damaged."""
-    from ..pipelines.engine.status import run_status
     from ..pipelines.reconstruct import all_stages
+    from ..pipelines.run.status import run_status
     from .output import scale_lines, status_table, warning_lines
 
     run = open_run(run_path)

@@ -33,7 +33,7 @@ from .system.progress import Progress, SilentProgress, Stopped, is_asked, log, s
 from .system.wording import markdown_table
 
 if TYPE_CHECKING:
-    from .engine.cluster import RayCluster
+    from .run.cluster import RayCluster
 
 T = TypeVar("T")
 _TRIES = 2

@@ -9,8 +9,6 @@ from ..formats.gps import read_track
 from ..formats.reading import require_listable, require_unicode
 from ..formats.video import probe_video
 from .config import GPS_AUTO, GPS_OFF, SOURCE_LIST, STAGES, Config, overridden, with_method, without_method
-from .engine.runner import run_stages
-from .engine.stages import Later, Stage, TaskWorkers
 from .frames.inputs import check_frames, frames_division
 from .mapping.division import mapping_division
 from .proxy.inputs import check_proxy
@@ -19,6 +17,8 @@ from .run.folder import RunFolder, load_records, load_settings, load_source
 from .run.lock import LOCK, SOFT_LOCK, locked, make_folder
 from .run.manifest import StageRecord, recorded_config
 from .run.progress import ProgressFile
+from .run.runner import run_stages
+from .run.stages import Later, Stage, TaskWorkers
 from .source.recording import open_recording
 from .source.videos import require_different
 from .system.machine import available_cpus, require_device

@@ -17,10 +17,10 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 from msgs_slam.pipelines import outcome
-from msgs_slam.pipelines.engine import stages
 from msgs_slam.pipelines.mapping import submap_tasks
 from msgs_slam.pipelines.render import api, cpu, inspection
 from msgs_slam.pipelines.render.notes import Notes
+from msgs_slam.pipelines.run import stages
 
 DEVICE = "meta"
 _COPIES = {torch.ops.aten.copy_.default, torch.ops.aten._to_copy.default}

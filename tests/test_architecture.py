@@ -20,7 +20,7 @@ FORBIDDEN = {
 
 FLOORS = (
     {"config", "types"}, {"geometry", "read_config"}, {"providers", "system"}, {"compute"},
-    {"render", "networks"}, {"depth"}, {"run", "sfm"}, {"engine", "source"},
+    {"render", "networks"}, {"depth"}, {"run", "sfm"}, {"source"},
     {"labels", "masks"}, {"frames", "proxy"}, {"mapping", "tracking"}, {"global_ba", "outcome"},
     {"paper", "scene"}, {"export"}, {"reconstruct"}, {"batch", "evaluation"}, {"viewer"},
 )  # fmt: skip

@@ -21,12 +21,12 @@ from ...formats.mesh import (
 )
 from ..compute.threads import get_threads, host_threads
 from ..config import ExportConfig
-from ..engine.stages import StageContext
-from ..engine.tasks import Chunk, in_chunks
 from ..geometry.camera import project, resample_nearest
 from ..geometry.posed_depth import PosedDepth
 from ..mapping.measure import DrawnView, Shown, drawn_view
 from ..outcome import Outcome, load_outcome, maps_around
+from ..run.stages import StageContext
+from ..run.tasks import Chunk, in_chunks
 from ..scene.world import World
 from ..system.parallel import LruSequence, map_lookahead
 from ..system.progress import Progress

@@ -12,8 +12,6 @@ import numpy as np
 from ...formats.atomic import copy_file
 from ...formats.errors import InputError, RecoverableError
 from ..config import Config
-from ..engine.runner import run_stages
-from ..engine.stages import Stage, StageContext
 from ..outcome import load_outcome
 from ..run.ending import discard
 from ..run.files import (
@@ -30,6 +28,8 @@ from ..run.files import (
 )
 from ..run.folder import RunFolder, load_records
 from ..run.manifest import piece_digest
+from ..run.runner import run_stages
+from ..run.stages import Stage, StageContext
 from ..scene.world import FIRST
 from ..system.progress import WithinStage
 from .writers import write_colmap, write_trajectory

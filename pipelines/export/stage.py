@@ -11,12 +11,12 @@ from typing import Any
 from ...formats.errors import InputError
 from ...formats.mesh import mesh_blocks
 from ..config import ExportConfig
-from ..engine.stages import StageContext
 from ..networks.registry import metric_card
 from ..outcome import Outcome, load_outcome
 from ..run.files import METRES, SUBMAPS
 from ..run.folder import RunFolder
 from ..run.lock import locked_export
+from ..run.stages import StageContext
 from ..run.target import Target, read_list
 from ..scene.gps import world_on_earth
 from ..scene.metres import find_metres

@@ -8,7 +8,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from ...formats.colmap import ModelArrays
-from ..engine.stages import StageContext
+from ..run.stages import StageContext
 
 _NOISY = 0.03
 """Standard deviation of the noise over the contrast of an image. Fifteen recordings by day: up to 0.012; one with a

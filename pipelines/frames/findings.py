@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from ...formats.colmap import ModelArrays, pose_of
 from ...formats.errors import InputError
-from ..engine.stages import StageContext
 from ..geometry.sparse_model import SparseModel
 from ..run.extension import ParentRun
+from ..run.stages import StageContext
 from ..sfm.adjust import focals_of_halves
 from ..sfm.candidates import GIVEN, GIVEN_ONLY
 from ..sfm.consistency import MAX_DRIFT

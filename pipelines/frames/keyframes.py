@@ -13,7 +13,7 @@ from ...formats.images import write_rgb
 from ...formats.textfile import read_json, write_json
 from ...formats.video import VideoFrame
 from ..config import FramesConfig
-from ..engine.stages import StageContext
+from ..run.stages import StageContext
 from ..sfm.flow import find_corners, follow
 from ..source.faces import Faces
 from ..source.overlap import Motion

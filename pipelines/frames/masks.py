@@ -21,11 +21,11 @@ from ...formats.names import match_names
 from ...formats.reading import note_read
 from ...formats.textfile import read_json, write_json
 from ..config import Config
-from ..engine.stages import StageContext
 from ..geometry.camera import ONE_CAMERA, Rig
 from ..masks.people import PeopleCards, PeopleFinder, people_cards
 from ..networks.registry import ModelStore
 from ..run.files import LEFT_OUT
+from ..run.stages import StageContext
 from ..source.recording import Recording, VideoRecording, open_recording
 from ..system.progress import Progress
 from ..types import Frame, any_of

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pycolmap
 
 from ...formats.errors import InputError
-from ..engine.stages import StageContext
+from ..run.stages import StageContext
 from ..sfm.candidates import GIVEN_ONLY
 from ..sfm.consistency import unexplained
 from ..sfm.driver import Structure, StructureFromMotion, no_prefetch

@@ -15,12 +15,12 @@ from ...formats.gps import photo_places
 from ...formats.images import read_rgb, write_rgb
 from ...formats.textfile import read_json, write_json
 from ...formats.video import VideoFrame
-from ..engine.stages import StageContext
-from ..engine.tasks import in_chunks
 from ..geometry.camera import Rig, rig_of
 from ..masks.static import find_static
 from ..run.extension import parent_of
 from ..run.files import BACKBONE, CALIBRATION, FEATURES, GIVEN_POSES, MATCHED_PAIRS, SPARSE, VOCABULARY, save_frames
+from ..run.stages import StageContext
+from ..run.tasks import in_chunks
 from ..sfm.driver import Structure
 from ..sfm.flow import Picture
 from ..sfm.lens import Lens, distortion_of, make_lens

@@ -9,10 +9,10 @@ import numpy as np
 
 from ...formats.errors import InputError
 from ...formats.textfile import read_json, write_json
-from ..engine.stages import StageContext
 from ..geometry.camera import Rig
 from ..masks.still import SAMPLED, find_still
 from ..run.extension import parent_of
+from ..run.stages import StageContext
 from ..sfm.two_views import HOW_TO_FILM
 from ..types import Frame
 from .masks import FrameMasks, grey_of

@@ -9,10 +9,10 @@ import pycolmap
 
 from ...formats.datasets.sequence import Camera
 from ...formats.images import read_rgb
-from ..engine.stages import StageContext
-from ..engine.tasks import Chunk
 from ..geometry.camera import Rig, rig_of
 from ..run.extension import parent_of
+from ..run.stages import StageContext
+from ..run.tasks import Chunk
 from ..sfm.driver import Divide, StructureFromMotion, no_prefetch
 from ..sfm.features import clear_of
 from ..sfm.lens import FOCAL_GUESS, calibrated_camera, to_pycolmap, unknown_camera

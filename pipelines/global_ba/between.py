@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from ...formats.errors import InputError
 from ...formats.video import VideoFrame
 from ..config import FramesConfig
-from ..engine.stages import StageContext
 from ..frames.learned import picture_features
 from ..geometry import se3
 from ..geometry.camera import Rig, rig_of
@@ -21,6 +20,7 @@ from ..geometry.sparse_model import SparseModel
 from ..mapping.move_map import follow_keyframes
 from ..run.files import CALIBRATION, EVERY_FRAME, FEATURES, FRAMES
 from ..run.folder import RunFolder
+from ..run.stages import StageContext
 from ..sfm.adjust import FEATURE_SD
 from ..sfm.lens import distorted_camera, make_lens, to_pycolmap
 from ..sfm.rolling import Shutter, velocities

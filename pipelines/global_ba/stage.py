@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from ...formats.atomic import copy_file
 from ..depth.align import sample_proxy
-from ..engine.stages import StageContext
 from ..geometry import se3
 from ..geometry.sparse_model import SparseModel
 from ..mapping.build import Refined, refine_map
@@ -29,6 +28,7 @@ from ..run.files import (
     TRAJECTORY,
 )
 from ..run.folder import RunFolder
+from ..run.stages import StageContext
 from ..sfm.adjust import FEATURE_SD
 from ..sfm.bundle import reprojection_errors
 from ..sfm.features import GlobalDescriptors, compute_global_descriptors, unit

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..depth.fields import DepthFields
-from ..engine.stages import StageContext
 from ..geometry.posed_depth import PosedDepth, overlaps
 from ..render.gaussian_map import GaussianMap
 from ..run.extension import ParentRun
 from ..run.files import CALIBRATION, CLASS_IDS, DEPTH_FIELDS, EXPOSURE, SUBMAPS
 from ..run.folder import RunFolder
+from ..run.stages import StageContext
 from ..system.machine import submap_size
 from ..types import Trajectory
 from .division import split_frames, submap_count

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from ..config import MappingConfig
 from ..depth.fields import DepthFields
 from ..depth.see_through import contradicted
-from ..engine.stages import StageContext
 from ..geometry.posed_depth import PosedDepth
 from ..run.files import CALIBRATION, DEPTH_FIELDS, FRAMES
 from ..run.folder import RunFolder
+from ..run.stages import StageContext
 from ..system.machine import VIEWS_SHARE, room_on
 from ..system.parallel import LruSequence
 from ..types import Frame, Intrinsics, ProxyMaps, Trajectory

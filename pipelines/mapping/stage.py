@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from ...formats.errors import InputError
-from ..engine.stages import StageContext
 from ..run.extension import parent_of
 from ..run.files import EXPOSURE, FIGURES, MAP, TRAJECTORY
+from ..run.stages import StageContext
 from .build import Mapped, build_map
 from .division import split_frames
 from .load import survey, with_rigid_panoramas

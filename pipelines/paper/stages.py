@@ -18,7 +18,6 @@ from torch import Tensor
 from ...formats.errors import InputError
 from ...formats.tensors import load_tensors, save_tensors
 from ..depth.fields import DepthFields
-from ..engine.stages import StageContext
 from ..geometry import se3
 from ..geometry.camera import project
 from ..geometry.se3 import Similarity
@@ -42,6 +41,7 @@ from ..run.files import (
     SPARSE,
     TRAJECTORY,
 )
+from ..run.stages import StageContext
 from ..system.machine import VIEWS_SHARE
 from ..system.parallel import LruSequence
 from ..system.progress import is_asked

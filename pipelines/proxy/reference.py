@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from ...formats.errors import InputError
 from ...formats.images import to_grey
 from ..depth.scale import DepthScale
-from ..engine.stages import StageContext
 from ..geometry.camera import unproject
 from ..labels.segments import SegmentLabels
 from ..providers import MAX_CLASSES, DepthEstimate, DepthProvider, Sequence, resize_area
 from ..run.files import BACKBONE, GIVEN_POSES
 from ..run.folder import RunFolder
+from ..run.stages import StageContext
 from ..sfm.flow import follow
 from ..sfm.given import fit_given_poses
 from ..source.recording import Recording, VideoRecording, open_recording

@@ -9,10 +9,10 @@ from ...formats.errors import InputError
 from ..depth.files import NO_DEPTH
 from ..depth.scale import DepthScale, measure_scale
 from ..depth.stereo.provider import MultiviewDepth
-from ..engine.stages import StageContext
 from ..masks.moving import find_moving
 from ..providers import dump_state
 from ..run.files import CLASSES, DESCRIPTORS, FIGURES, FRAME_SCALES, LEFT_OUT, PROXY_MAPS
+from ..run.stages import StageContext
 from ..system.progress import log
 from ..types import VOID, Frame
 from .reference import ReferenceScale, reference_scale, scale_figures

@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..depth.scale import DepthScale
-from ..engine.stages import StageContext
-from ..engine.tasks import Chunk, in_chunks
 from ..geometry.camera import resample_nearest
 from ..geometry.voxels import to_lab
 from ..masks.moving import SIDE, MovingView, find_moving_once
@@ -25,6 +23,8 @@ from ..providers import (
     resize_area,
 )
 from ..run.files import BACKBONE, CALIBRATION, FRAMES, LEFT_OUT, PROXY_MAPS
+from ..run.stages import StageContext
+from ..run.tasks import Chunk, in_chunks
 from ..source.recording import open_recording
 from ..system.parallel import map_lookahead
 from ..system.progress import Progress

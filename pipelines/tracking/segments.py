@@ -8,10 +8,10 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from ..engine.stages import StageContext
 from ..geometry import se3
 from ..geometry.se3 import Similarity
 from ..run.files import GIVEN_POSES
+from ..run.stages import StageContext
 from ..sfm.given import fit_given_poses
 from ..system.wording import stretches
 from ..types import Array, GivenPoses

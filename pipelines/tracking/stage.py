@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from ...formats.errors import InputError
-from ..engine.stages import StageContext
 from ..geometry.camera import Rig, rig_of
 from ..run.files import (
     BACKBONE,
@@ -19,6 +18,7 @@ from ..run.files import (
     SPARSE,
     TRAJECTORY,
 )
+from ..run.stages import StageContext
 from ..sfm.adjust import FEATURE_SD
 from ..sfm.rolling import Shutter
 from ..system.machine import release_free_memory

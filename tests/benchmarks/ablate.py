@@ -24,7 +24,6 @@ from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.textfile import read_json_object, write_json
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.stages import Stage
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.read_config import config_to_toml, load_config
@@ -32,6 +31,7 @@ from msgs_slam.pipelines.reconstruct import all_stages, reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings, load_source, save_settings
 from msgs_slam.pipelines.run.manifest import Manifest, StageRecord, write_manifest
 from msgs_slam.pipelines.run.reads import Reads
+from msgs_slam.pipelines.run.stages import Stage
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 
 COMPLETE = "complete"

@@ -27,13 +27,13 @@ from poses import compare, recordings
 from tracking import Case, in_process, original_names, prepare
 
 from msgs_slam.formats.colmap import pose_of
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames import stage as frames_stage
 from msgs_slam.pipelines.frames import tasks
 from msgs_slam.pipelines.frames.keyframes import pick_frames
 from msgs_slam.pipelines.geometry.camera import ONE_CAMERA
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.sfm import candidates
 from msgs_slam.pipelines.sfm import driver as sfm
 from msgs_slam.pipelines.sfm.snapshots import Snapshots

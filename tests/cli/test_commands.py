@@ -354,7 +354,7 @@ def test_commands_that_look_at_a_run_keep_to_its_threads(
     def asked(threads: int) -> None:
         raise InputError(f"{threads} threads")
 
-    monkeypatch.setattr("msgs_slam.pipelines.engine.tasks.limit_threads", asked)
+    monkeypatch.setattr("msgs_slam.pipelines.run.tasks.limit_threads", asked)
     run = finished_run.folder
     for words in (
         ("export", run, "--to", tmp_path / "out"), ("render", run, tmp_path / "film.avi"), ("report", run),

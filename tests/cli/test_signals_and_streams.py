@@ -13,10 +13,9 @@ from cli_runs import FinishedRun, invoke
 
 from msgs_slam.formats.errors import DiskFullError
 from msgs_slam.formats.video_writer import write_video
-from msgs_slam.pipelines.engine import runner
-from msgs_slam.pipelines.engine.runner import forget_peak, peak_memory_mb
-from msgs_slam.pipelines.run import folder
+from msgs_slam.pipelines.run import folder, runner
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.runner import forget_peak, peak_memory_mb
 from msgs_slam.pipelines.system.progress import Stopped, is_asked, soft_stop, stop_if_asked
 
 COMMAND = [sys.executable, "-m", "msgs_slam"]

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from cli_runs import QUICK, FinishedRun, files_below, invoke
 
-from msgs_slam.pipelines.engine import stages
 from msgs_slam.pipelines.outcome import load_outcome
+from msgs_slam.pipelines.run import stages
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_source
 from msgs_slam.pipelines.run.lock import locked
 from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest

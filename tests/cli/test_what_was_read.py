@@ -18,8 +18,8 @@ from cli_runs import QUICK, FinishedRun, invoke
 
 from msgs_slam.formats.images import write_grey_png
 from msgs_slam.pipelines.config import STAGES, Config
-from msgs_slam.pipelines.engine import runner
 from msgs_slam.pipelines.reconstruct import all_stages
+from msgs_slam.pipelines.run import runner
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings, load_source
 from msgs_slam.pipelines.run.manifest import StageRecord
 from msgs_slam.pipelines.run.reads import Situation

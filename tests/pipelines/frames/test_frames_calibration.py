@@ -13,8 +13,8 @@ from msgs_slam.formats.datasets.sequence import Camera
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.poses import read_poses
 from msgs_slam.formats.reading import noting_files
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import run
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.sfm.lens import distortion_of, make_lens, set_lens, to_pycolmap, unknown_camera
 from msgs_slam.pipelines.source.given import read_intrinsics
 from msgs_slam.pipelines.source.recording import FolderRecording

@@ -14,12 +14,12 @@ import pytest
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_grey_png, read_rgb, write_grey_png, write_rgb
 from msgs_slam.pipelines.config import Config, FramesConfig
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.findings import warn_of_people
 from msgs_slam.pipelines.frames.masks import masks_for
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.run.files import SPARSE
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.sfm.driver import Structure
 from msgs_slam.pipelines.source.recording import open_recording
 from tests.pipelines.frames.conftest import HEIGHT, WALK_FRAMES, WIDTH, Walk, bluish, render, sideways

@@ -13,7 +13,6 @@ from msgs_slam.formats.datasets import Camera, Sequence, open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.frames.keyframes import pick_frames
 from msgs_slam.pipelines.frames.tasks import known_camera
@@ -25,6 +24,7 @@ from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.sfm.lens import FramePixels, distortion_of, make_lens, to_pycolmap
 from msgs_slam.pipelines.source.recording import DatasetRecording, FolderRecording, open_recording
 from msgs_slam.pipelines.system.progress import SilentProgress

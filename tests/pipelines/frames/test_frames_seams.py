@@ -8,8 +8,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.findings import warn_of_structure
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.sfm.adjust import adjust_model
 from msgs_slam.pipelines.sfm.components import (
     PairCheck,

@@ -15,11 +15,11 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_grey_png, write_rgb
 from msgs_slam.formats.video_writer import write_video
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import places_figure, run
 from msgs_slam.pipelines.reconstruct import one_source
 from msgs_slam.pipelines.run.folder import RunFolder, load_source
 from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.source.recording import FolderRecording, VideoRecording, open_recording
 from msgs_slam.pipelines.types import Frame
 

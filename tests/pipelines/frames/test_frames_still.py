@@ -10,10 +10,10 @@ import pytest
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_grey_png, read_rgb, write_rgb
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.run.files import SPARSE
+from msgs_slam.pipelines.run.stages import StageContext
 from tests.pipelines.frames.conftest import HEIGHT, WIDTH, Walk
 
 TOP = 150

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.images import read_rgb, to_grey, write_rgb
 from msgs_slam.pipelines.depth.fields import FINE, Grid, field_scales
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.export.extra.texture import _seen
 from msgs_slam.pipelines.frames.keyframes import choose_keyframes
 from msgs_slam.pipelines.frames.stage import run
@@ -24,6 +23,7 @@ from msgs_slam.pipelines.paper.slam import fitted_field
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Intrinsics
 from tests.pipelines.frames.conftest import QUICK, Walk, render, sideways

@@ -12,13 +12,13 @@ import pytest
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.trajectory import read_tum
 from msgs_slam.pipelines.config import Config, FramesConfig, GlobalBaConfig
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.truth import absolute_error
 from msgs_slam.pipelines.export.writers import write_trajectory
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.between import Placer, pose_every_frame
 from msgs_slam.pipelines.run.files import BACKBONE, EVERY_FRAME, FRAMES, LEFT_OUT, save_frames
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.types import Trajectory
 from tests.pipelines.global_ba.test_global_ba_stage import BreakOff
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames

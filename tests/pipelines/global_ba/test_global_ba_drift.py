@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.depth.fields import FINE, DepthFields
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.image_quality import DepthErrorSum
 from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.geometry import se3
@@ -32,6 +31,7 @@ from msgs_slam.pipelines.run.files import (
     TRAJECTORY,
 )
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.types import Trajectory
 from tests.pipelines.global_ba.test_global_ba_stage import FIRST_AGAIN, seeded_map
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.depth.fields import DepthFields
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import unproject
 from msgs_slam.pipelines.geometry.se3 import align_points
@@ -34,6 +33,7 @@ from msgs_slam.pipelines.run.files import (
     TRAJECTORY,
 )
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.types import Trajectory
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames, small_motion
 from tests.world.clip import WorldFrame

@@ -15,7 +15,6 @@ from finished import note_finished
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.trajectory import read_tum
 from msgs_slam.pipelines.config import Config, ExportConfig, MappingConfig, RunConfig
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.export import stage as export_stage
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.export.volume import Grid
@@ -24,6 +23,7 @@ from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping.load import load_views
 from msgs_slam.pipelines.run.files import CLASSES, EXPOSURE, MAP, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.scene.world import WORLD
 from msgs_slam.pipelines.system.machine import room_on
 from msgs_slam.pipelines.system.progress import SilentProgress

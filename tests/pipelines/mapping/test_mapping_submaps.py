@@ -14,7 +14,6 @@ from scipy import sparse
 
 from msgs_slam.formats.tensors import load_tensors
 from msgs_slam.pipelines.config import Config, MappingConfig, RunConfig
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.mapping import exposure as gauge
@@ -27,6 +26,7 @@ from msgs_slam.pipelines.outcome import load_outcome, maps_around
 from msgs_slam.pipelines.run.files import DEPTH_FIELDS, MAP, SUBMAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.schema import RunFile
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.system.machine import MIN_SUBMAP, submap_size
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Intrinsics

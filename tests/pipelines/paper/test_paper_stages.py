@@ -15,7 +15,6 @@ from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.config import Config, ProxyConfig, RunConfig, with_method
 from msgs_slam.pipelines.depth.fields import DepthFields
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.paper import stages
 from msgs_slam.pipelines.paper.constants import PAPER, constants_of
@@ -25,6 +24,7 @@ from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.run.files import CLASS_IDS, CLASSES, DEPTH_FIELDS, MAP, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder, load_settings
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Trajectory
 from tests.networks import save_network

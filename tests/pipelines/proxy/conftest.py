@@ -7,10 +7,10 @@ import pytest
 from proxy_room import Room, perfect_backbone, write_source
 
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, save_frames
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, Frame
 from tests.pipelines.kept import keep_correspondences

@@ -105,7 +105,7 @@ def wrong_weights(folder: Path) -> str:
 def test_bad_input_is_refused_before_the_frames_are_picked(
     source: Path, tmp_path: Path, spoil: Callable[[Path], str], said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("msgs_slam.pipelines.engine.runner._run_one", lambda *_: pytest.fail("a stage was run"))
+    monkeypatch.setattr("msgs_slam.pipelines.run.runner._run_one", lambda *_: pytest.fail("a stage was run"))
     config = settings(spoil(source.parent))
     with pytest.raises(InputError, match=said):
         reconstruct(source, RunFolder(tmp_path / "run"), config, SilentProgress(), "proxy")

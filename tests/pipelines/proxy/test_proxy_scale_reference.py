@@ -10,7 +10,6 @@ from proxy_room import UNIT, Room
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.camera import unproject, unproject_depth
 from msgs_slam.pipelines.proxy.inputs import check_proxy
 from msgs_slam.pipelines.proxy.reference import Reference, parse_reference
@@ -19,6 +18,7 @@ from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import FRAMES, PROXY_MAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.tracking.stage import run as track
 
@@ -64,7 +64,7 @@ def test_bad_references_are_refused_before_anything_slow(
     make_context: Make, tmp_path: Path, text: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = make_context().source
-    monkeypatch.setattr("msgs_slam.pipelines.engine.runner._run_one", lambda *_: pytest.fail("a stage was run"))
+    monkeypatch.setattr("msgs_slam.pipelines.run.runner._run_one", lambda *_: pytest.fail("a stage was run"))
     config = load_config(overrides=[setting(text), "run.device=cpu"])
     with pytest.raises(InputError, match=said):
         reconstruct(source, RunFolder(tmp_path / "new"), config, SilentProgress())

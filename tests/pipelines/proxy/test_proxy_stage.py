@@ -15,12 +15,12 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
 from msgs_slam.formats.textfile import read_json
 from msgs_slam.pipelines.depth.files import FilesDepth
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.labels.files import FilesLabels
 from msgs_slam.pipelines.masks.moving import MovingView
 from msgs_slam.pipelines.providers import DepthEstimate, LabelEstimate
 from msgs_slam.pipelines.proxy.stage import run
 from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, DESCRIPTORS, PROXY_MAPS
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.types import VOID, Frame
 from tests.killed import KillAt, Killed
 from tests.pipelines.travelling import Travelling

@@ -18,7 +18,6 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.reading import noting_files
 from msgs_slam.formats.tensors import save_arrays
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.labels import count_labels, score
 from msgs_slam.pipelines.networks.card import read_card
 from msgs_slam.pipelines.networks.labels import network_probabilities
@@ -28,6 +27,7 @@ from msgs_slam.pipelines.proxy.inputs import check_proxy
 from msgs_slam.pipelines.proxy.stage import run
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import CLASSES, PROXY_MAPS
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.types import VOID
 from tests.networks import PICTURE, save_network
 from tests.world.room import CLASSES as ROOM_CLASSES

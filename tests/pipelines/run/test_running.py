@@ -10,12 +10,12 @@ import pytest
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines import reconstruct
 from msgs_slam.pipelines.config import STAGES, Config
-from msgs_slam.pipelines.engine.stages import Stage, StageContext
-from msgs_slam.pipelines.engine.status import run_status
 from msgs_slam.pipelines.run import ending, progress
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import is_locked, locked
 from msgs_slam.pipelines.run.progress import PROGRESS, RunProgress, load_run_progress
+from msgs_slam.pipelines.run.stages import Stage, StageContext
+from msgs_slam.pipelines.run.status import run_status
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 States = list[tuple[str, ...]]

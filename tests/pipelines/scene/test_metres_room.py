@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from msgs_slam.formats.textfile import read_json, write_json
 from msgs_slam.pipelines.config import Config, ExportConfig
 from msgs_slam.pipelines.depth.fields import DepthFields
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.export.stage import metres_figures
 from msgs_slam.pipelines.export.stage import run as export
 from msgs_slam.pipelines.geometry.room_layout import CEILING, FLOOR, OTHER, Gravity
@@ -21,6 +20,7 @@ from msgs_slam.pipelines.geometry.voxels import Voxels
 from msgs_slam.pipelines.networks.registry import _room_classes
 from msgs_slam.pipelines.run.files import DEPTH_FIELDS, FIGURES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.scene import metres as find
 from msgs_slam.pipelines.scene.evidence import CEILING_HEIGHT, OUTDOORS, Evidence
 from msgs_slam.pipelines.scene.heights import camera_height, ceiling_height, floor_trust, sizes_of_things

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from msgs_slam.pipelines.engine.stages import Later
 from msgs_slam.pipelines.reconstruct import all_stages
+from msgs_slam.pipelines.run.stages import Later
 from msgs_slam.pipelines.system.identity import package_digest
 
 

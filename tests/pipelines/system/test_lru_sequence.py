@@ -13,8 +13,8 @@ import pytest
 from msgs_slam.pipelines.compute import threads
 from msgs_slam.pipelines.compute.threads import get_threads
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.system import machine as limits
 from msgs_slam.pipelines.system.machine import available_cpus, machine_memory, memory_room
 from msgs_slam.pipelines.system.parallel import LruSequence
@@ -100,7 +100,7 @@ def test_a_value_that_is_kept_again_counts_once() -> None:
 
 PEAKS = """
 import numpy as np
-from msgs_slam.pipelines.engine.runner import forget_peak, peak_memory_mb
+from msgs_slam.pipelines.run.runner import forget_peak, peak_memory_mb
 peaks = [peak_memory_mb()]
 block = np.ones(40_000_000)
 peaks.append(peak_memory_mb())

@@ -10,8 +10,6 @@ import torch
 
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.pipelines.config import STAGES, Config, ExportConfig, GlobalBaConfig, MappingConfig, ProxyConfig
-from msgs_slam.pipelines.engine.runner import run_stages
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.mapping import growth
@@ -23,6 +21,8 @@ from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.run.files import MAP, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.runner import run_stages
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.viewer.render_run import render_run
 from msgs_slam.pipelines.viewer.scene import load_scenes

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from msgs_slam.formats.images import to_grey, write_rgb
 from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry.camera import project, unproject
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, CLASSES, PROXY_MAPS, save_frames
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.sfm.bundle import Bundle
 from msgs_slam.pipelines.sfm.flow import find_corners
 from msgs_slam.pipelines.system.progress import SilentProgress

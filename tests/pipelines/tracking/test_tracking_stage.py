@@ -13,7 +13,6 @@ import pytest
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
@@ -28,6 +27,7 @@ from msgs_slam.pipelines.run.files import (
     SPARSE,
     TRAJECTORY,
 )
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.sfm.features import global_descriptor
 from msgs_slam.pipelines.tracking import adjust, pictures, segments, stage
 from msgs_slam.pipelines.tracking.stage import run as run_tracking

@@ -8,10 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.stages import StageContext
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.tracking.front_end import fit_rotation, turn_between
 from msgs_slam.pipelines.tracking.pictures import Pictures
 from msgs_slam.pipelines.tracking.stage import run as run_tracking

@@ -15,7 +15,7 @@ from msgs_slam.pipelines.config import STAGES, Config
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.ending import RECORD, discard, empty
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
-from tests.pipelines.engine.recorder import Recorder
+from tests.pipelines.run.recorder import Recorder
 
 CALLS = ("replace", "rename", "unlink", "rmdir", "mkdir", "fsync", "open")
 KILLED = 99
@@ -106,7 +106,7 @@ def interrupted(root: Path, monkeypatch: pytest.MonkeyPatch, *settings: str, **c
 
     config = load_config(overrides=settings)
     with monkeypatch.context() as patch:
-        patch.setattr("msgs_slam.pipelines.engine.runner.move_in", stop)
+        patch.setattr("msgs_slam.pipelines.run.runner.move_in", stop)
         with pytest.raises(KeyboardInterrupt):
             bring(root, config, **changes)
 
@@ -142,7 +142,7 @@ def test_a_disk_that_is_full_for_the_manifest_costs_no_stage(tmp_path: Path, mon
         raise DiskFullError("no room")
 
     def fill() -> None:
-        monkeypatch.setattr("msgs_slam.pipelines.engine.runner.write_manifest", full)
+        monkeypatch.setattr("msgs_slam.pipelines.run.runner.write_manifest", full)
 
     with pytest.raises(DiskFullError):
         bring(tmp_path / "r", at_end=fill)

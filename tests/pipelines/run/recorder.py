@@ -6,9 +6,9 @@ from typing import Any
 
 from msgs_slam.formats.atomic import write_text
 from msgs_slam.pipelines.config import STAGES, Config
-from msgs_slam.pipelines.engine.runner import run_stages
-from msgs_slam.pipelines.engine.stages import SameSource, Stage, StageContext, trust_source
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.runner import run_stages
+from msgs_slam.pipelines.run.stages import SameSource, Stage, StageContext, trust_source
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 

@@ -10,9 +10,9 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.engine.stages import StageContext
-from msgs_slam.pipelines.engine.tasks import Chunk, in_chunks, limit_threads
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
+from msgs_slam.pipelines.run.tasks import Chunk, in_chunks, limit_threads
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 from tests.pipelines.travelling import Travelling
 

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from msgs_slam.formats.errors import InputError, RecoverableError
-from msgs_slam.pipelines.engine import cluster as cluster_module
-from msgs_slam.pipelines.engine.cluster import RETRIES, RayCluster
+from msgs_slam.pipelines.run import cluster as cluster_module
+from msgs_slam.pipelines.run.cluster import RETRIES, RayCluster
 from msgs_slam.pipelines.system.progress import SilentProgress, Stopped, soft_stop
 from tests.pipelines import task_calls
 

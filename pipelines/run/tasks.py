@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..config import Config
-from ..run.folder import RunFolder
 from ..system.progress import Progress
+from .folder import RunFolder
 from .stages import StageContext
 
 R = TypeVar("R")

@@ -11,10 +11,10 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines import reconstruct
 from msgs_slam.pipelines.config import STAGES, Config
-from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import made_with
 from msgs_slam.pipelines.run.folder import RunFolder, load_settings
+from msgs_slam.pipelines.run.stages import Stage, StageContext
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 

@@ -12,11 +12,11 @@ from msgs_slam.formats.errors import DiskFullError, InputError
 from msgs_slam.formats.reading import note_read
 from msgs_slam.formats.textfile import read_text
 from msgs_slam.pipelines.config import STAGES, Config, MappingConfig
-from msgs_slam.pipelines.engine.stages import Stage, StageContext
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_stale
 from msgs_slam.pipelines.run.reads import LOGS
-from tests.pipelines.engine.recorder import Recorder
+from msgs_slam.pipelines.run.stages import Stage, StageContext
+from tests.pipelines.run.recorder import Recorder
 
 
 @pytest.fixture

@@ -13,9 +13,12 @@ from ...formats.atomic import is_disk_full, remove_temporaries
 from ...formats.errors import DiskFullError, InputError, RecoverableError
 from ...formats.reading import links_in
 from ..config import STAGES, Config
-from ..run.ending import empty, find_sealed, move_in, results, seal, unseal
-from ..run.folder import RunFolder, load_records, load_stale, save_settings
-from ..run.manifest import (
+from ..system.machine import release_free_memory
+from ..system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log, stop_if_asked
+from ..system.wording import quoted
+from .ending import empty, find_sealed, move_in, results, seal, unseal
+from .folder import RunFolder, load_records, load_stale, save_settings
+from .manifest import (
     Manifest,
     Source,
     StageRecord,
@@ -25,11 +28,8 @@ from ..run.manifest import (
     settings_of,
     write_manifest,
 )
-from ..run.progress import TimeLeft
-from ..run.reads import ReadLog, Situation, begin_log, reads_in, watched
-from ..system.machine import release_free_memory
-from ..system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log, stop_if_asked
-from ..system.wording import quoted
+from .progress import TimeLeft
+from .reads import ReadLog, Situation, begin_log, reads_in, watched
 from .stages import SameSource, Stage, StageContext, TaskWorkers, stopping_after_writes, trust_source
 from .tasks import limit_threads
 

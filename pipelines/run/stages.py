@@ -11,12 +11,12 @@ from typing import Any, Protocol, TypeVar
 
 from ...formats.atomic import after_each_write
 from ..config import Config
-from ..run.ending import SNAPSHOT
-from ..run.folder import RunFolder
-from ..run.reads import active_log
 from ..system.identity import package_digest
 from ..system.machine import available_cpus, memory_room, release_free_memory, resolve_device
 from ..system.progress import Progress, log, stop_if_asked
+from .ending import SNAPSHOT
+from .folder import RunFolder
+from .reads import active_log
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -5,11 +5,11 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from ..config import STAGES, Config
-from ..run.folder import RunFolder, load_records, load_settings, load_source, load_stale, why_not_done
-from ..run.manifest import StageRecord
-from ..run.progress import RunProgress, load_run_progress
-from ..run.reads import Situation
 from ..system.wording import quoted
+from .folder import RunFolder, load_records, load_settings, load_source, load_stale, why_not_done
+from .manifest import StageRecord
+from .progress import RunProgress, load_run_progress
+from .reads import Situation
 from .runner import rerun_reason
 from .stages import Stage
 
