@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.networks.labels import best_classes, network_probabilities
+from msgs_slam.pipelines.networks.outputs import best_classes, network_probabilities
 from msgs_slam.pipelines.networks.session import Network
 
 

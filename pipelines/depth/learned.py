@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ..networks.card import Card
-from ..networks.depth import network_depth
 from ..networks.network_pass import Arrays, NetworkPass, Workplace
+from ..networks.outputs import network_depth
 from ..networks.session import Network, card_identity
 from ..providers import DepthEstimate, DepthProvider, Sequence
 from ..types import Frame
-from .scale import depth_at_points
+from .fused import depth_at_points
 
 Array = NDArray[np.float64]
 _MIN_POINTS = 12

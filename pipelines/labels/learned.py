@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ..networks.card import Card
-from ..networks.labels import best_classes, class_token, network_probabilities, patch_features, softmax
 from ..networks.network_pass import Arrays, NetworkPass, Workplace
+from ..networks.outputs import best_classes, class_token, network_probabilities, patch_features, softmax
 from ..networks.session import Network, card_identity
 from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, class_colors, resample_linear
 from ..types import VOID, ClassTable, Frame

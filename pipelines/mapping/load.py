@@ -9,8 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..config import MappingConfig
-from ..depth.fields import DepthFields
-from ..depth.see_through import contradicted
+from ..depth.fields import DepthFields, contradicted
 from ..geometry.posed_depth import PosedDepth
 from ..run.files import CALIBRATION, DEPTH_FIELDS, FRAMES
 from ..run.folder import RunFolder

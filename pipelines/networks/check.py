@@ -15,8 +15,7 @@ from ..geometry.voxels import normals_in_cam
 from ..system.wording import BAD, GOOD, NOTE, Finding
 from ..types import Intrinsics
 from .card import Card
-from .depth import network_depth
-from .labels import network_probabilities
+from .outputs import network_depth, network_probabilities
 from .runtime import is_tflite
 from .session import Letterbox, Network
 

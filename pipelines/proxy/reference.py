@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ...formats.images import to_grey
-from ..depth.scale import DepthScale
+from ..depth.fused import DepthScale
 from ..geometry.camera import unproject
 from ..labels.segments import SegmentLabels
 from ..providers import MAX_CLASSES, DepthEstimate, DepthProvider, Sequence, resize_area

@@ -131,7 +131,7 @@ def _wants_fusion(around: ProviderContext, choice: Choice, learned: DepthProvide
     network that somebody ran before, and the points of structure from motion decide which."""
     if around.config.fuse != "learned" or choice.card is not None:
         return around.config.fuse != "never"
-    from ..depth.scale import measure_scale
+    from ..depth.fused import measure_scale
 
     posed = [f for f in around.sequence.frames if f.id in around.sequence.cam_from_world]
     strays = measure_scale(around.sequence, posed[:: len(posed) // _FILES_LOOKED_AT + 1], learned.estimate).spread_in

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...formats.errors import InputError
 from ..depth.files import NO_DEPTH
-from ..depth.scale import DepthScale, measure_scale
+from ..depth.fused import DepthScale, measure_scale
 from ..depth.stereo.provider import MultiviewDepth
 from ..masks.moving import find_moving
 from ..providers import dump_state

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..depth.scale import DepthScale
+from ..depth.fused import DepthScale
 from ..geometry.camera import resample_nearest
 from ..geometry.voxels import to_lab
 from ..masks.moving import SIDE, MovingView, find_moving_once

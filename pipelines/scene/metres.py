@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..depth.fields import DepthFields
 from ..networks.card import Card
-from ..networks.depth import network_depth
+from ..networks.outputs import network_depth
 from ..networks.session import Letterbox, Network
 from ..run.files import CALIBRATION, CLASSES, DEPTH_FIELDS, FIGURES, FRAME_SCALES, FRAMES, PROXY_MAPS
 from ..run.folder import RunFolder

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.depth.align import fit_fields
-from msgs_slam.pipelines.depth.see_through import contradicted
-from msgs_slam.pipelines.depth.stereo.neighbours import choose_neighbours, depth_range
+from msgs_slam.pipelines.depth.fields import contradicted
+from msgs_slam.pipelines.depth.stereo.consistency import choose_neighbours, depth_range
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import pixel_centers, project
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth, neighbours

@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.pipelines.networks import download
+from msgs_slam.pipelines.networks import registry
 from msgs_slam.pipelines.networks.registry import ModelStore
 from tests.networks import save_network
 
@@ -83,7 +83,7 @@ def test_what_the_program_recommends_can_be_pulled(
         fetched.append(target.stem)
         return sha256
 
-    monkeypatch.setattr(download, "fetch", deliver)
+    monkeypatch.setattr(registry, "fetch", deliver)
     done = models("pull", "--yes", *words)
     assert done.exit_code == 0, done.output
     assert {"ade20k-small", "fast-depth", "person"} <= set(fetched)

@@ -18,7 +18,7 @@ from msgs_slam.pipelines.depth.align import (
     keyframe_scale,
     scale_at_points,
 )
-from msgs_slam.pipelines.depth.see_through import contradicted
+from msgs_slam.pipelines.depth.fields import contradicted
 from msgs_slam.pipelines.evaluation.html import Line, Marks, plot
 from msgs_slam.pipelines.evaluation.image_quality import DepthError, DepthErrorSum
 from msgs_slam.pipelines.evaluation.labels import matched_one_to_one, score

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from ...compute import gpu
 from . import matching as rules
-from .smoothing import DIRECTIONS, path_starts
 from .sweep import ALIKE
-from .volume import TILE, UNREACHED
+from .volume import DIRECTIONS, TILE, UNREACHED, path_starts
 from .window import LIKENESS, OUTSIDE, RADIUS, SIDE, STEP, VARIANCE_FLOOR
 
 Array = NDArray[np.float32]

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
-from .smoothing import smooth_cost
 from .sweep import refine_inverse_depth, sweep_cost
-from .volume import TILE, Bands, least_planes, pick_planes, tiles_of
+from .volume import TILE, Bands, least_planes, pick_planes, smooth_cost, tiles_of
 
 MIN_BEST, MAX_BEST = 3, 5
 """Of the views that one is matched with, the better half counts at a pixel, but not fewer or more than these."""

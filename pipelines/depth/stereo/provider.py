@@ -25,14 +25,12 @@ from ...types import Frame, Intrinsics
 from ..completion.candidates import LENT_CONFIDENCE, Half, invert
 from ..completion.evidence import ASKED, LENDERS, Case, ask_again, gather_case
 from ..completion.fill import SURE, evidence_of, smooth_confidence
-from ..completion.keyframe import HALF, TWICE, as_completed, complete, halved, trusted
-from .consistency import fuse_depths
+from ..completion.network import HALF, TWICE, as_completed, complete, halved, trusted
+from .consistency import choose_neighbours, depth_range, fuse_depths
 from .matching import StereoImages, match_planes
-from .neighbours import choose_neighbours, depth_range
 from .sweep import warps_to
-from .upsample import upsample_depth
 from .volume import Bands
-from .window import surface_contrast
+from .window import surface_contrast, upsample_depth
 
 _CACHED_FRAMES = 48
 _VIEWS, _FUSE_VIEWS = 12, 8

@@ -11,9 +11,8 @@ import msgs_slam.pipelines.depth.stereo.matching as matching
 from msgs_slam.pipelines.compute.adam import descend_by_kernel, plain_descend
 from msgs_slam.pipelines.depth.stereo import card
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths
-from msgs_slam.pipelines.depth.stereo.smoothing import smooth_cost
 from msgs_slam.pipelines.depth.stereo.sweep import refine_inverse_depth, sweep_cost
-from msgs_slam.pipelines.depth.stereo.volume import Bands
+from msgs_slam.pipelines.depth.stereo.volume import Bands, smooth_cost
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure
 from msgs_slam.pipelines.mapping.objective import Objective, color_errors_on_card, fit_exposure_on_card

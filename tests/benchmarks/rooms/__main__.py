@@ -29,9 +29,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.depth.completion.keyframe import complete
-from msgs_slam.pipelines.depth.fused import FusedDepth
-from msgs_slam.pipelines.depth.scale import measure_scale
+from msgs_slam.pipelines.depth.completion.network import complete
+from msgs_slam.pipelines.depth.fused import FusedDepth, measure_scale
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.geometry.camera import resample_nearest
 from msgs_slam.pipelines.providers import DepthEstimate, DepthProvider, Sequence

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.depth import align as alignment
 from msgs_slam.pipelines.depth import fields as solve
 from msgs_slam.pipelines.depth.align import COARSE, align_keyframes, fit_fields
-from msgs_slam.pipelines.depth.fields import FINE, DepthFields, Equations, field_scales, solve_fields
-from msgs_slam.pipelines.depth.see_through import contradicted
+from msgs_slam.pipelines.depth.fields import FINE, DepthFields, Equations, contradicted, field_scales, solve_fields
 from msgs_slam.pipelines.geometry.posed_depth import CANDIDATES, PosedDepth, overlaps
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.mapping.load import MappingInput

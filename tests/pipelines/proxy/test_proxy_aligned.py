@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from proxy_room import UNIT, Room
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.pipelines.depth.fused import measure_scale
 from msgs_slam.pipelines.depth.learned import AlignedDepth, fit_relative, to_depth
-from msgs_slam.pipelines.depth.scale import measure_scale
 from msgs_slam.pipelines.providers import DepthEstimate
 from msgs_slam.pipelines.types import Frame
 

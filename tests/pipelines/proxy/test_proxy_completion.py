@@ -13,14 +13,19 @@ from msgs_slam.pipelines.depth.completion import network as rooms_network
 from msgs_slam.pipelines.depth.completion.candidates import KINDS, Half
 from msgs_slam.pipelines.depth.completion.evidence import STEP_OF_NUMBERS, Case, ask_again, gather_case
 from msgs_slam.pipelines.depth.completion.fill import SURE, agreed_depth, carry_depth, local_planes, smooth_confidence
-from msgs_slam.pipelines.depth.completion.keyframe import HALF, TWICE, as_completed, complete, halved, trusted
 from msgs_slam.pipelines.depth.completion.network import (
+    HALF,
+    TWICE,
     CompletionNetwork,
     Mixture,
+    as_completed,
+    complete,
+    halved,
     inputs_of,
     load_network,
     middle_of,
     numbers_of,
+    trusted,
 )
 from msgs_slam.pipelines.depth.stereo.sweep import warps_to
 from msgs_slam.pipelines.depth.stereo.window import surface_contrast

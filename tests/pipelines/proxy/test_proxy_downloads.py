@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.networks import download
-from msgs_slam.pipelines.networks.download import fetch
+from msgs_slam.pipelines.networks import registry
+from msgs_slam.pipelines.networks.registry import fetch
 
 Serve = Callable[..., str]
 OK = b"HTTP/1.1 200 OK\r\n"
@@ -63,15 +63,15 @@ def test_redirects_lead_to_https_only(serve: Serve, tmp_path: Path, location: by
 
 
 def test_this_machine_is_reached_from_itself_alone() -> None:
-    assert download._is_safe("http://localhost:8000/m")
+    assert registry._is_safe("http://localhost:8000/m")
     for url in (
         "http://127.0.0.1.example.invalid/m",
         "http://example.invalid/m",
         "ftp://example.invalid/m",
         "https://",
     ):
-        assert not download._is_safe(url)
-    assert not download._is_safe("http://localhost:8000/m", from_own_host=False)
+        assert not registry._is_safe(url)
+    assert not registry._is_safe("http://localhost:8000/m", from_own_host=False)
 
 
 @pytest.mark.parametrize(
@@ -100,8 +100,8 @@ def test_folders_in_the_way(serve: Serve, tmp_path: Path) -> None:
 
 
 def test_a_server_that_sends_without_end_is_left(serve: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(download, "_MAX_UNKNOWN", 1000)
-    url = serve(OK + b"\r\n", *[b"x" * download._CHUNK] * 4)
+    monkeypatch.setattr(registry, "_MAX_UNKNOWN", 1000)
+    url = serve(OK + b"\r\n", *[b"x" * registry._CHUNK] * 4)
     with pytest.raises(InputError, match="more than the expected 1000 bytes"):
         fetch([url], tmp_path / "m", 0, "", lambda done, size: None)
     assert not list(tmp_path.iterdir())

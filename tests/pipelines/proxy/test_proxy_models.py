@@ -13,8 +13,7 @@ import pytest
 
 from msgs_slam.formats.errors import DiskFullError, InputError
 from msgs_slam.pipelines.config import ProxyConfig
-from msgs_slam.pipelines.networks.download import fetch
-from msgs_slam.pipelines.networks.registry import Model, ModelStore
+from msgs_slam.pipelines.networks.registry import Model, ModelStore, fetch
 from msgs_slam.pipelines.proxy.selection import choose_depth
 from msgs_slam.pipelines.read_config import load_config
 
@@ -89,7 +88,7 @@ def test_404_and_a_wrong_hash_go_to_the_next_mirror(
     behaviour.missing = ("/gone",)
     fetch([f"{url}/gone", f"{url}/m"], tmp_path / "m.onnx", len(DATA), SHA, silent)
     assert [p for p, _ in behaviour.requests] == ["/gone", "/m"]
-    assert [r.getMessage().count("404 Not Found") for r in caplog.records] == [1]
+    assert [r.getMessage().count("404 Client Error: Not Found") for r in caplog.records] == [1]
     with pytest.raises(InputError, match=r"does not match"):
         fetch([f"{url}/m"], tmp_path / "n.onnx", len(DATA), "0" * 64, silent)
     assert not list(tmp_path.glob("n.onnx*"))

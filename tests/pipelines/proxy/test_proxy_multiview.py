@@ -13,10 +13,9 @@ from proxy_room import UNIT, Room, write_source
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
 from msgs_slam.pipelines.config import ProxyConfig
-from msgs_slam.pipelines.depth.fused import FusedDepth, fuse, sharpen_steps
-from msgs_slam.pipelines.depth.scale import measure_scale
+from msgs_slam.pipelines.depth.fused import FusedDepth, fuse, measure_scale, sharpen_steps
 from msgs_slam.pipelines.depth.stereo import provider as stereo_provider
-from msgs_slam.pipelines.depth.stereo.neighbours import depth_range
+from msgs_slam.pipelines.depth.stereo.consistency import depth_range
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.labels.segments import SegmentLabels
 from msgs_slam.pipelines.providers import DepthEstimate, Sequence

@@ -14,7 +14,7 @@ from msgs_slam.pipelines.geometry.room_layout import FLOOR, OTHER, Gravity
 from msgs_slam.pipelines.geometry.voxels import Voxels, merge, voxel_keys
 from msgs_slam.pipelines.labels.named import NamedScene, Vocabulary, disputed, name_likelihood, one_name_each
 from msgs_slam.pipelines.labels.segments import SegmentLabels
-from msgs_slam.pipelines.networks.labels import best_classes
+from msgs_slam.pipelines.networks.outputs import best_classes
 from msgs_slam.pipelines.providers import DepthEstimate, resample_linear
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame

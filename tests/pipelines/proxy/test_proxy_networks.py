@@ -16,9 +16,8 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.depth.learned import OnnxDepth
 from msgs_slam.pipelines.networks.card import Card, read_card
-from msgs_slam.pipelines.networks.depth import network_depth, solve_shift, solve_shift_and_focal
-from msgs_slam.pipelines.networks.labels import class_token
 from msgs_slam.pipelines.networks.network_pass import ResultCache, Workplace
+from msgs_slam.pipelines.networks.outputs import class_token, network_depth, solve_shift, solve_shift_and_focal
 from msgs_slam.pipelines.networks.runtime import external_locations, require_own_weights
 from msgs_slam.pipelines.networks.session import Network, choose_box
 from msgs_slam.pipelines.networks.words import load_linear_head

@@ -16,11 +16,24 @@ from msgs_slam.pipelines.depth.stereo.matching import (
     planes_to_try,
 )
 from msgs_slam.pipelines.depth.stereo.provider import at_stops
-from msgs_slam.pipelines.depth.stereo.smoothing import smooth_cost
 from msgs_slam.pipelines.depth.stereo.sweep import refine_inverse_depth, sweep_cost, warps_to
-from msgs_slam.pipelines.depth.stereo.upsample import upsample_depth
-from msgs_slam.pipelines.depth.stereo.volume import TILE, UNREACHED, Bands, least_planes, pick_planes, tiles_of
-from msgs_slam.pipelines.depth.stereo.window import LIKENESS, RADIUS, STEP, VARIANCE_FLOOR, surface_contrast
+from msgs_slam.pipelines.depth.stereo.volume import (
+    TILE,
+    UNREACHED,
+    Bands,
+    least_planes,
+    pick_planes,
+    smooth_cost,
+    tiles_of,
+)
+from msgs_slam.pipelines.depth.stereo.window import (
+    LIKENESS,
+    RADIUS,
+    STEP,
+    VARIANCE_FLOOR,
+    surface_contrast,
+    upsample_depth,
+)
 from tests.dense_volumes import of_dense, to_dense
 
 HEIGHT, WIDTH, FOCAL = 40, 60, 50.0

@@ -18,7 +18,6 @@ from test_proxy_stereo import CAMERAS, MATRIX, scene, view_of_plane  # noqa: E40
 from msgs_slam.pipelines.compute import gpu  # noqa: E402
 from msgs_slam.pipelines.depth.stereo import card, matching  # noqa: E402
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths  # noqa: E402
-from msgs_slam.pipelines.depth.stereo.smoothing import smooth_cost  # noqa: E402
 from msgs_slam.pipelines.depth.stereo.sweep import (  # noqa: E402
     refine_inverse_depth,
     sweep_cost,
@@ -29,6 +28,7 @@ from msgs_slam.pipelines.depth.stereo.volume import (  # noqa: E402
     UNREACHED,
     Bands,
     pick_planes,
+    smooth_cost,
 )
 from tests.card_builds import build  # noqa: E402
 from tests.dense_volumes import of_dense, to_dense  # noqa: E402

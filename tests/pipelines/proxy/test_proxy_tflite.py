@@ -14,7 +14,7 @@ from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.masks.people import person_probability
 from msgs_slam.pipelines.networks.card import Card, read_card
-from msgs_slam.pipelines.networks.depth import network_depth
+from msgs_slam.pipelines.networks.outputs import network_depth
 from msgs_slam.pipelines.networks.registry import ModelStore, missing_networks
 from msgs_slam.pipelines.networks.session import Network, card_identity
 from msgs_slam.pipelines.proxy.selection import choose_depth, choose_semantics

@@ -20,7 +20,7 @@ from msgs_slam.formats.tensors import save_arrays
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.evaluation.labels import count_labels, score
 from msgs_slam.pipelines.networks.card import read_card
-from msgs_slam.pipelines.networks.labels import network_probabilities
+from msgs_slam.pipelines.networks.outputs import network_probabilities
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.networks.words import MAX_WORDS, with_words
 from msgs_slam.pipelines.proxy.inputs import check_proxy
