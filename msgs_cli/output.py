@@ -112,7 +112,7 @@ class Output:
         return self.progress(name)
 
     def report(self, text: str) -> None:
-        """Print a line on stderr, or log it as JSON, for people who wait."""
+        """Print a line on stderr, or log it as JSON, while the user waits."""
         if self.as_json and not self.quiet:
             write_line("log", level="info", message=text)
         elif not self.quiet:

@@ -76,10 +76,7 @@ def cache_root() -> Path | None:
 
 
 def _is_private(directory: Path) -> bool:
-    """Makes the folder if need be; whether it can be written, is ours, and nobody else may write there.
-
-    The cache is executable code: in a shared temporary folder another user could have put it there first.
-    """
+    """Make the folder if need be; whether it is ours alone: another user could have put machine code there first."""
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         status = directory.lstat()

@@ -41,8 +41,8 @@ def map_lookahead(function: Callable[[T], R], items: Iterable[T], threads: int) 
 
 
 class LruCache(Generic[K, R]):
-    """The values of `make` for the keys asked for last, at most `limit` of them; who asks for one that another thread
-    is making waits for it. `make` may ask others of its kind, but not itself in a circle."""
+    """The values of `make` for the keys asked for last, at most `limit` of them; a thread that asks for one that
+    another is making waits for it. `make` may ask others of its kind, but not itself in a circle."""
 
     def __init__(self, make: Callable[[K], R], limit: int) -> None:
         self._make, self._limit = make, limit
@@ -75,8 +75,7 @@ class LruCache(Generic[K, R]):
 class LruSequence(Sequence[T], Generic[T]):
     """The values of `make` for 0 to `count` - 1, those used last kept while they need at most `room` bytes together.
 
-    `make` gives the same value whenever it is called with the same number, so that nobody sees what is kept. May be
-    asked from several threads.
+    `make` gives the same value whenever it is called with the same number. May be asked from several threads.
     """
 
     def __init__(self, count: int, make: Callable[[int], T], size_of: Callable[[T], int], room: float) -> None:
@@ -99,7 +98,7 @@ class LruSequence(Sequence[T], Generic[T]):
         key = range(self._count)[index]  # raises IndexError, counts from the end
         with self._lock:
             making = self._making.setdefault(key, Lock())
-        with making:  # this one alone: others are had meanwhile, and nobody makes it twice
+        with making:  # made once; other values are made meanwhile
             with self._lock:
                 if key in self._kept:
                     self._kept.move_to_end(key)

@@ -1,5 +1,5 @@
-"""Progress of a stage, independent of who shows it; and stopping softly: the first signal asks, and the work ends at
-the next moment at which nothing is lost."""
+"""Progress of a stage, however it is shown; and stopping softly: the first signal asks, and the work ends at the next
+moment at which nothing is lost."""
 
 import logging
 import signal
@@ -68,7 +68,7 @@ class Progress(Protocol):
 
 
 class LineProgress:
-    """A line on stderr a stage, and every ten minutes of a longer one: for files, pipes, and who watches from afar."""
+    """A line on stderr a stage, and every ten minutes of a longer one, for files and pipes."""
 
     def __init__(self, name: str = "") -> None:
         self._before, self._stage = f"{name}: " if name else "", ""

@@ -112,16 +112,17 @@ def test_kinds_of_files_by_the_names_of_their_formats(word: str, kind: str) -> N
     assert invoke("export", "no_such_run", "--only", word).exit_code == 1, "no wrong usage"
 
 
-def test_missing_source(tmp_path: Path) -> None:
-    assert "no such file" in refused(tmp_path / "missing.mp4", tmp_path / "run")
-
-
-def test_empty_file_and_text_file(tmp_path: Path) -> None:
-    video = tmp_path / "video.mp4"
-    video.write_bytes(b"")
-    assert "is empty" in refused(video, tmp_path / "run")
-    video.write_text("this is not a video")
-    assert "video.mp4" in refused(video, tmp_path / "run")
+def test_sources_that_are_missing_empty_or_no_video(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    (tmp_path / "empty.mp4").touch()
+    (tmp_path / "text.mp4").write_text("this is not a video")
+    for name, said in (
+        ("none.mp4", "no such file"),
+        ("empty.mp4", "is empty"),
+        ("text.mp4", "text.mp4"),
+        ("images", "image"),
+    ):
+        assert said in refused(tmp_path / name, tmp_path / "run")
 
 
 def test_a_user_who_does_not_exist(tmp_path: Path) -> None:
@@ -158,12 +159,6 @@ def test_names_that_are_no_utf_8(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert not (tmp_path / "run").exists()
     assert invoke("batch", folder, "--out", tmp_path / "runs").exit_code == 1
     assert "no valid UTF-8" in (tmp_path / "runs" / "batch.md").read_text()
-
-
-def test_empty_folder(tmp_path: Path) -> None:
-    folder = tmp_path / "images"
-    folder.mkdir()
-    assert "image" in refused(folder, tmp_path / "run")
 
 
 def test_folder_of_something_else_is_not_touched(tmp_path: Path) -> None:
