@@ -252,7 +252,9 @@ def require_parallax(
     `focal` in pixels where it is known; else every plausible one is tried, so that no wrong guess of it can hide a
     pure rotation.
     """
-    moved = [p for p in pairs if _displacement(p, xy) > _MIN_DISPLACEMENT_PX]
+    steps = (xy[p.first][p.matches[:, 0]] - xy[p.second][p.matches[:, 1]] for p in pairs)
+    far = [np.median(np.linalg.norm(step, axis=1)) > _MIN_DISPLACEMENT_PX for step in steps]
+    moved = [p for p, is_far in zip(pairs, far, strict=True) if is_far]
     if not moved:
         return
     moved = moved[:: max(1, len(moved) // _SAMPLED_PAIRS)]
@@ -311,11 +313,6 @@ def rotation_residual(
     second = _turned_rays(xy[pair.second][pair.matches[:, 1]] - centre, focal)
     angle = np.linalg.norm(first @ best_rotation(first, second).T - second, axis=1)
     return float(np.percentile(angle, 80) * focal)
-
-
-def _displacement(pair: VerifiedPair, xy: Sequence[NDArray[np.float64]]) -> float:
-    moved = xy[pair.first][pair.matches[:, 0]] - xy[pair.second][pair.matches[:, 1]]
-    return float(np.median(np.linalg.norm(moved, axis=1)))
 
 
 def _turned_rays(xy: NDArray[np.float64], focal: float) -> NDArray[np.float64]:

@@ -195,13 +195,9 @@ def group_by_points(keyframes: Iterable[int], state: TrackState) -> list[list[in
     """Keyframes in order, each in one group with the one before it if they see common points."""
     groups: list[list[int]] = []
     for keyframe in sorted(keyframes):
-        if groups and _share_points(groups[-1][-1], keyframe, state):
+        points = state.sightings[keyframe].point
+        if groups and np.isin(state.sightings[groups[-1][-1]].point, points).sum() >= COMMON_POINTS:
             groups[-1].append(keyframe)
         else:
             groups.append([keyframe])
     return groups
-
-
-def _share_points(first: int, second: int, state: TrackState) -> bool:
-    shared = np.isin(state.sightings[first].point, state.sightings[second].point).sum()
-    return bool(shared >= COMMON_POINTS)

@@ -1,10 +1,13 @@
-"""Projection: against OpenCV, against its own inverse, and for Gaussians against the general formula."""
+"""Projection; voxels looked up in blocks; rooms of which nothing or next to nothing was seen."""
 
 import cv2
 import numpy as np
+import pytest
 import torch
 
+from msgs_slam.pipelines.geometry import voxels
 from msgs_slam.pipelines.geometry.camera import pixel_centers, project, project_gaussians, unproject, unproject_depth
+from msgs_slam.pipelines.geometry.room_layout import CEILING, OTHER, Gravity, find_gravity, floor_plane, name_structure
 from msgs_slam.pipelines.types import Intrinsics
 
 CAMERA = Intrinsics(64, 48, 51.0, 53.0, 31.3, 25.2)
@@ -60,3 +63,51 @@ def test_gradients_stay_finite_at_and_behind_the_camera():
     (u + v + sigma).sum().backward()
     assert torch.isfinite(p.grad).all()
     assert p.grad[2, 2] != 0
+
+
+@pytest.mark.parametrize("missing", [0, 1, 5_000])
+def test_a_missing_voxel_is_answered_by_one_that_touches_it(missing: int) -> None:
+    """Also where more are missing than are looked up at once."""
+    rng = np.random.default_rng(missing)
+    there = np.unique(voxels.voxel_keys(rng.integers(0, 30, (4_000, 3)) + 0.5, 1.0))
+    asked = voxels.voxel_keys(rng.integers(-4, 34, (missing + 7, 3)) + 0.5, 1.0).reshape(-1, 1)
+    asked[:7, 0] = there[:7]
+    asked[7:8] = -1  # too far out to have a voxel
+    around = voxels.find(there, voxels.neighbour_keys(asked.ravel()))
+    one = np.take_along_axis(around, (around >= 0).argmax(1)[:, None], 1)
+    expected = np.where(voxels.find(there, asked) >= 0, voxels.find(there, asked), one)
+    expected[asked == -1] = -1
+    found = voxels.find_near(there, asked)
+    assert found.shape == asked.shape
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(voxels.find_near(there, np.repeat(asked, 3, axis=1)), np.repeat(expected, 3, axis=1))
+    if missing > 1:
+        outside = voxels.cells_of(asked.ravel()[8:]).min(1) < -1  # touches nothing
+        assert outside.any()
+        assert (found.ravel()[8:][outside] == -1).all()
+        assert (found.ravel()[8:] >= 0).sum() > voxels._BLOCK // 27
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+@pytest.mark.parametrize("slant", [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0)])
+@pytest.mark.parametrize("cam_up", [(0.0, 2.0, 0.0), (0.0, 0.0, 0.0)])
+def test_a_room_of_next_to_no_surface_has_an_up_and_no_floor(
+    count: int, slant: tuple[float, ...], cam_up: tuple[float, ...]
+) -> None:
+    """Level or upright surface, and cameras whose upward axes cancel out."""
+    points = np.arange(3.0 * count).reshape(count, 3)
+    frames = [
+        (voxels.voxel_keys(points, 1.0), np.hstack([np.ones((count, 1)), points, np.tile(slant, (count, 1)), points]))
+    ]
+    few, centres = voxels.merge(1.0, frames), np.zeros((2, 3))
+    assert len(few) == count
+    found = find_gravity(few, np.array(cam_up))
+    assert np.isfinite(found.up).all()
+    if not count:
+        assert not found.is_sure
+        np.testing.assert_array_equal(found.up, np.array(cam_up) / max(np.linalg.norm(cam_up), 1))
+    for gravity in (found, Gravity(np.array([0.0, 1, 0]), True)):
+        kind = name_structure(few, gravity, centres)
+        assert len(kind) == count
+        assert gravity.is_sure or (kind == OTHER).all()
+        assert floor_plane(few, kind, gravity.up) is floor_plane(few, kind, gravity.up, CEILING) is None
