@@ -115,26 +115,16 @@ def settings_of(config: Config, stage: str) -> dict[str, dict[str, Any]]:
     return {section: config_to_dict(getattr(config, section)) for section in ("run", stage)}
 
 
-def differing_settings(record: StageRecord, config: Config) -> list[str]:
-    """`section.key=value` of each setting that `config` has otherwise than the record keeps of it, read or not."""
-    return [
-        f"{section}.{key}={value}"
-        for section, values in record.settings.items()
-        if section != "run" and hasattr(config, section)  # a section may be of an earlier version
-        for key, value in config_to_dict(getattr(config, section)).items()
-        if values.get(key, value) != value
-    ]
-
-
 def previous_settings(record: StageRecord, config: Config) -> list[str]:
     """`section.key=value` of each setting of which `config` has another value than the record, with that of the
     record."""
-    keys = [text.partition("=")[0].partition(".") for text in differing_settings(record, config)]
-    return [f"{section}.{key}={_typed(record.settings[section][key])}" for section, _, key in keys]
-
-
-def _typed(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    now = config_to_dict(config)  # without a section or a key of an earlier version
+    return [
+        f"{section}.{key}={str(value).lower() if isinstance(value, bool) else value}"
+        for section, values in record.settings.items()
+        for key, value in values.items()
+        if section != "run" and now.get(section, {}).get(key, value) != value
+    ]
 
 
 def piece_digest(records: Mapping[str, StageRecord], name: str) -> str:
