@@ -135,7 +135,8 @@ class ProxyStage:
             return
         self.warn(
             f"the depth network sees a focal length of {network_focal:.0f} pixels, the calibration "
-            f"({calibration.origin}) says {focal:.0f} +- {calibration.focal_sd:.0f}: give --intrinsics if you know the camera"
+            f"({calibration.origin}) says {focal:.0f} +- {calibration.focal_sd:.0f}: give --intrinsics if you know the "
+            "camera"
         )
 
     def _warn_of_guesses(self, reliable: float) -> None:

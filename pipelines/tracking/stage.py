@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ...formats.errors import InputError
-from ..geometry.camera import Rig, rig_of
+from ..geometry.camera import rig_of
 from ..run.files import (
     BACKBONE,
     CALIBRATION,
@@ -20,7 +20,6 @@ from ..run.files import (
 )
 from ..run.stages import StageContext
 from ..sfm.adjust import FEATURE_SD
-from ..sfm.rolling import Shutter
 from ..system.machine import release_free_memory
 from ..system.progress import is_asked
 from ..system.values import load_value, save_value
@@ -48,46 +47,130 @@ _LONG = 1.0
 
 def run(context: StageContext) -> dict[str, Any]:
     """Keyframes from structure from motion, every other frame against them, then everything adjusted together."""
-    frames = context.run.load(FRAMES)
-    proxy = context.run.load(FIGURES["proxy"])
-    settings = without_dependent_depth(context.config.tracking, proxy)
-    metric = bool(proxy.get("metric", False))
-    pictures = Pictures(context.run, context.config.frames)
-    intrinsics = pictures.intrinsics
+    return TrackingStage(context).run()
 
-    state = track_frames(context, frames, pictures)
-    require_poses(context, state, frames, 2 if context.run.find(GIVEN_POSES) is None else 1)
-    report = adjust_state(state, intrinsics, pictures.proxy, metric, settings)
-    release_free_memory()
-    _, apart = drop_loose(state, report, intrinsics, context.config.frames.least_piece)
-    carried = carry_given(context, state, apart)
-    require_poses(context, state, frames, 2)
-    set_rotation_only_poses(state, pictures, context.config.run.seed)
-    if state.turned:
-        context.warn(
-            f"{len(state.turned)} frames ({stretches(state.turned)}) are posed by rotation alone: their orientation "
-            "relative to neighbouring frames is known, their position is not"
-        )
-    state, *pieces = split_worlds(state, context.config.frames.least_piece)
-    save_pieces(context, pieces, frames)
 
-    trajectory = to_trajectory(state, frames)
-    TRAJECTORY.save(context.folder, trajectory)
-    model = sparse_model_of(state)
-    SPARSE.save(context.folder, model)
-    FRAME_OBSERVATIONS.save(context.folder, to_frame_observations(state))
-    DEPTH_FIELDS.save(context.folder, align_depths(model, report, intrinsics, pictures.proxy))
-    figures = {**stage_figures(state, frames, report, metric), **carried}
-    figures["pieces"] = [len(p.poses) for p in pieces]
-    if "reference_relative_sd" in proxy:  # what the user's reference leaves open; depths agree far better
-        figures["scale_relative_sd"] = proxy["reference_relative_sd"]
-    FIGURES["tracking"].save(context.folder, figures)
-    lost = set(state.lost).difference(*(p.poses for p in pieces))
-    if lost:
-        context.warn(f"{len(lost)} frames have no pose: {stretches(lost)}")
-    if len(state.rig) == 1:
-        warn_of_stretches(context, frames, lost.union(state.turned, *(p.turned for p in pieces)))
-    return figures
+class TrackingStage:
+    """The steps of the stage; a `TrackState` holds the poses and points so far."""
+
+    def __init__(self, context: StageContext) -> None:
+        self.context, self.config = context, context.config
+        self.frames = context.run.load(FRAMES)
+        self.proxy = context.run.load(FIGURES["proxy"])
+        self.is_metric = bool(self.proxy.get("metric", False))
+        self.pictures = Pictures(context.run, context.config.frames)
+
+    def run(self) -> dict[str, Any]:
+        """Do the stage; its key figures."""
+        pictures, seed, least_piece = self.pictures, self.config.run.seed, self.config.frames.least_piece
+        state = self._track_frames()
+        self._require_poses(state, 2 if self.context.run.find(GIVEN_POSES) is None else 1)
+        settings = without_dependent_depth(self.config.tracking, self.proxy)
+        report = adjust_state(state, pictures.intrinsics, pictures.proxy, self.is_metric, settings)
+        release_free_memory()
+        _, apart = drop_loose(state, report, pictures.intrinsics, least_piece)
+        carried = carry_given(self.context, state, apart)
+        self._require_poses(state, 2)
+        set_rotation_only_poses(state, pictures, seed)
+        self._warn_of_turned(state)
+        state, *pieces = split_worlds(state, least_piece)
+        self._save_pieces(pieces)
+        self._save(state, report)
+        figures = {**self._figures(state, report), **carried, "pieces": [len(p.poses) for p in pieces]}
+        if "reference_relative_sd" in self.proxy:  # what the user's reference leaves open; depths agree far better
+            figures["scale_relative_sd"] = self.proxy["reference_relative_sd"]
+        FIGURES["tracking"].save(self.context.folder, figures)
+        self._warn_of_lost(state, pieces)
+        return figures
+
+    def _track_frames(self) -> TrackState:
+        """Every frame visited once; goes on from the last snapshot."""
+        snapshot, frames, seed = self.context.snapshot / "state.npz", self.frames, self.config.run.seed
+        state: TrackState = load_value(snapshot) if snapshot.exists() else self._start_state()
+        front_end = FrontEnd(state, self.pictures, seed)
+        every = max(SNAPSHOT_EVERY, len(frames) // SNAPSHOTS)
+        for frame in self.context.progress.track(frames[state.done :], "tracking", len(frames) - state.done):
+            if frame.id not in state.poses:
+                front_end.track(frame.id)
+            state.done += 1
+            if state.done % every == 0 or is_asked():
+                save_value(snapshot, state)
+        sync_rig_poses(state)
+        # Frames before the first keyframe could not be followed from anywhere; now there are neighbours behind them.
+        for frame_id in sorted(state.lost, reverse=True):
+            front_end.track(frame_id, may_start=False)
+        join_segments(state, self.pictures, seed)
+        sync_rig_poses(state)
+        return state
+
+    def _start_state(self) -> TrackState:
+        """The backbone, its parts and what structure from motion could place only among itself as segments, or
+        nothing."""
+        run = self.context.run
+        rig, shutter = rig_of(run.load(CALIBRATION).directions, len(self.frames)), load_shutter(run)
+        backbone = run.find(BACKBONE)
+        if backbone is None:
+            return TrackState(rig=rig, shutter=shutter)
+        state = TrackState.from_backbone(backbone, FEATURE_SD, rig, shutter)
+        split_segments(state)
+        for piece in run.pieces("frames"):
+            state.add_segment(TrackState.from_backbone(run.load(SPARSE, "frames", piece=piece), FEATURE_SD))
+        return state
+
+    def _require_poses(self, state: TrackState, least: int) -> None:
+        """Raise InputError where fewer than `least` frames have a pose."""
+        if len(state.poses) < least:
+            raise InputError(
+                f"{self.context.source}: no camera motion could be recovered from {len(self.frames)} frames. Possible "
+                "causes: a camera that stands still or only turns, plain or blurred images, or wrong --intrinsics. "
+                "Move the camera sideways, or choose another part"
+            )
+
+    def _save_pieces(self, pieces: list[TrackState]) -> None:
+        """Write the disconnected components, each in a world and a unit of its own."""
+        for number, piece in enumerate(pieces, 2):
+            folder = self.context.folder / f"piece_{number}"
+            TRAJECTORY.save(folder, to_trajectory(piece, self.frames))
+            SPARSE.save(folder, sparse_model_of(piece))
+            self.context.warn(
+                f"{len(piece.poses)} frames ({stretches(sorted(piece.poses))}) form a disconnected component: they are "
+                f"exported separately, as piece_{number}"
+            )
+
+    def _save(self, state: TrackState, report: Report) -> None:
+        folder, model = self.context.folder, sparse_model_of(state)
+        TRAJECTORY.save(folder, to_trajectory(state, self.frames))
+        SPARSE.save(folder, model)
+        FRAME_OBSERVATIONS.save(folder, to_frame_observations(state))
+        DEPTH_FIELDS.save(folder, align_depths(model, report, self.pictures.intrinsics, self.pictures.proxy))
+
+    def _figures(self, state: TrackState, report: Report) -> dict[str, Any]:
+        world = report.ties.world
+        return {
+            "frames": len(self.frames),
+            "posed": len(state.poses),
+            "keyframes": len(state.keyframes),
+            "by_rotation": len(state.turned),
+            "lost": {str(i): reason for i, reason in sorted(state.lost.items())},
+            "scale": "metric" if self.is_metric and world else "free",
+            "scale_relative_sd": world.relative_sd if world else None,
+            **report.figures,
+        }
+
+    def _warn_of_turned(self, state: TrackState) -> None:
+        if state.turned:
+            self.context.warn(
+                f"{len(state.turned)} frames ({stretches(state.turned)}) are posed by rotation alone: their "
+                "orientation relative to neighbouring frames is known, their position is not"
+            )
+
+    def _warn_of_lost(self, state: TrackState, pieces: list[TrackState]) -> None:
+        lost = set(state.lost).difference(*(p.poses for p in pieces))
+        if lost:
+            self.context.warn(f"{len(lost)} frames have no pose: {stretches(lost)}")
+        if len(state.rig) == 1:
+            unplaced = lost.union(state.turned, *(p.turned for p in pieces))
+            warn_of_stretches(self.context, self.frames, unplaced)
 
 
 def warn_of_stretches(context: StageContext, frames: list[Frame], unplaced: Collection[int]) -> None:
@@ -103,75 +186,3 @@ def warn_of_stretches(context: StageContext, frames: list[Frame], unplaced: Coll
                 "could be located: the camera stood still, only turned, or saw too little, such as a bare wall. Film "
                 "that part again while walking, with something textured in view"
             )
-
-
-def require_poses(context: StageContext, state: TrackState, frames: list[Frame], least: int) -> None:
-    """Raise InputError where fewer than `least` frames have a pose."""
-    if len(state.poses) < least:
-        raise InputError(
-            f"{context.source}: no camera motion could be recovered from {len(frames)} frames. Possible causes: a "
-            "camera that stands still or only turns, plain or blurred images, or wrong --intrinsics. "
-            "Move the camera sideways, or choose another part"
-        )
-
-
-def track_frames(context: StageContext, frames: list[Frame], pictures: Pictures) -> TrackState:
-    """Every frame visited once; goes on from the last snapshot."""
-    snapshot = context.snapshot / "state.npz"
-    rig = rig_of(context.run.load(CALIBRATION).directions, len(frames))
-    shutter = load_shutter(context.run)
-    state: TrackState = load_value(snapshot) if snapshot.exists() else start_state(context, rig, shutter)
-    front_end = FrontEnd(state, pictures, context.config.run.seed)
-    every = max(SNAPSHOT_EVERY, len(frames) // SNAPSHOTS)
-    for frame in context.progress.track(frames[state.done :], "tracking", len(frames) - state.done):
-        if frame.id not in state.poses:
-            front_end.track(frame.id)
-        state.done += 1
-        if state.done % every == 0 or is_asked():
-            save_value(snapshot, state)
-    sync_rig_poses(state)
-    # Frames before the first keyframe could not be followed from anywhere; now there are neighbours behind them.
-    for frame_id in sorted(state.lost, reverse=True):
-        front_end.track(frame_id, may_start=False)
-    join_segments(state, pictures, context.config.run.seed)
-    sync_rig_poses(state)
-    return state
-
-
-def start_state(context: StageContext, rig: Rig, shutter: Shutter) -> TrackState:
-    """The backbone, its parts and what structure from motion could place only among itself as segments, or nothing."""
-    backbone = context.run.find(BACKBONE)
-    if backbone is None:
-        return TrackState(rig=rig, shutter=shutter)
-    state = TrackState.from_backbone(backbone, FEATURE_SD, rig, shutter)
-    split_segments(state)
-    for piece in context.run.pieces("frames"):
-        state.add_segment(TrackState.from_backbone(context.run.load(SPARSE, "frames", piece=piece), FEATURE_SD))
-    return state
-
-
-def save_pieces(context: StageContext, pieces: list[TrackState], frames: list[Frame]) -> None:
-    """Write the disconnected components, each in a world and a unit of its own."""
-    for number, piece in enumerate(pieces, 2):
-        folder = context.folder / f"piece_{number}"
-        TRAJECTORY.save(folder, to_trajectory(piece, frames))
-        SPARSE.save(folder, sparse_model_of(piece))
-        context.warn(
-            f"{len(piece.poses)} frames ({stretches(sorted(piece.poses))}) form a disconnected component: they are "
-            f"exported separately, as piece_{number}"
-        )
-
-
-def stage_figures(state: TrackState, frames: list[Frame], report: Report, metric: bool) -> dict[str, Any]:
-    """Return the stage's key figures, by name."""
-    world = report.ties.world
-    return {
-        "frames": len(frames),
-        "posed": len(state.poses),
-        "keyframes": len(state.keyframes),
-        "by_rotation": len(state.turned),
-        "lost": {str(i): reason for i, reason in sorted(state.lost.items())},
-        "scale": "metric" if metric and world else "free",
-        "scale_relative_sd": world.relative_sd if world else None,
-        **report.figures,
-    }

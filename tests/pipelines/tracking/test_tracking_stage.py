@@ -84,7 +84,7 @@ def test_given_poses_of_which_no_frame_could_be_posed_are_no_motion(
     track: Track, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given = GivenPoses(np.full((24, 4, 4), np.nan), True, "made up")
-    monkeypatch.setattr(stage, "track_frames", lambda *_: TrackState())
+    monkeypatch.setattr(stage.TrackingStage, "_track_frames", lambda *_: TrackState())
     with pytest.raises(InputError, match="no camera motion could be recovered from 24 frames"):
         track(lambda made: GIVEN_POSES.save(made.run.stage("frames"), given))
 
