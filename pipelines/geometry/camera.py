@@ -105,7 +105,7 @@ def resize_depth(depth: NDArray[np.float32], height: int, width: int) -> NDArray
 
 
 def resize_maps(maps: ProxyMaps, height: int, width: int) -> ProxyMaps:
-    """All of a frame's maps at another size."""
+    """Resize all of a frame's maps to another size."""
     if maps.depth.shape == (height, width):
         return maps
     sampled = (resample_nearest(m, height, width) for m in (maps.confidence, maps.labels, maps.label_confidence))
@@ -153,7 +153,7 @@ def rig_of(directions: int, frames: int) -> Rig:
 def reduce_to_rig(
     blocks: Array, pairs: NDArray[np.int64], right: Array, frame_ids: NDArray[np.int64], rig: Rig
 ) -> tuple[Array, NDArray[np.int64], Array, NDArray[np.int64], Array]:
-    """The upper blocks (B, 6, 6) at pairs (B, 2) and right sides (6 N,) of N cameras as those of their S places.
+    """Reduce the upper blocks (B, 6, 6) at pairs (B, 2) and right sides (6 N,) of N cameras as those of their S places.
 
     A step d of a place moves its camera c by adjoint(cam_from_rig[c]) d, which here is a turn of both halves: see
     Sola et al., A micro Lie theory for state estimation in robotics, eq. (20). Returns blocks, pairs, right sides, the

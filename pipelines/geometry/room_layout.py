@@ -27,7 +27,7 @@ class Gravity:
 
 
 def find_gravity(voxels: Voxels, cam_up: NDArray[np.float64]) -> Gravity:
-    """Up is the normal direction of the most surface within 40° of the cameras' mean up `cam_up` (people hold
+    """Find up: the normal direction of the most surface within 40° of the cameras' mean up `cam_up` (people hold
     cameras upright). Opposite normals (floor and ceiling) count as the same direction. Without any surface there, the
     cameras' up, unsure."""
     cam_up = cam_up / max(float(np.linalg.norm(cam_up)), 1e-12)
@@ -87,7 +87,7 @@ class FloorPlane:
 def floor_plane(
     voxels: Voxels, kinds: NDArray[np.int64], up: NDArray[np.float64], kind: int = FLOOR
 ) -> FloorPlane | None:
-    """The plane of the voxels that `name_structure` called floor (or CEILING, for `kind`), robustly; None without any.
+    """Fit the plane of the voxels that `name_structure` called floor (or CEILING, for `kind`); None without any.
 
     Up by normals is good to a degree or two, which is centimetres at the feet: the floor's own plane is exact.
     """

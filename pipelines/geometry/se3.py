@@ -193,7 +193,7 @@ class Similarity:
 
 
 def align_points(source: NDArray, target: NDArray, with_scale: bool = True) -> Similarity:
-    """The similarity (or, without scale, the rigid motion) that takes source (N, 3) to target (N, 3).
+    """Fit the similarity (or, without scale, the rigid motion) that takes source (N, 3) to target (N, 3).
 
     Least squares in closed form (Umeyama, PAMI 1991). Raises ValueError for fewer than three points, points
     that are not finite, or points on one line, where the rotation is not determined.

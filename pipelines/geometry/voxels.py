@@ -132,7 +132,7 @@ def gather_frame(
     size: float,
     given_normals: NDArray[np.int8] | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """One frame's voxels: keys (V,), and (V, 10) weight and weighted sums of position, normal and Lab colour.
+    """Gather one frame's voxels: keys (V,), and (V, 10) weight and weighted sums of position, normal and Lab colour.
 
     All images have the size of `intrinsics`. Normals (h, w, 3) in 127ths that a network gave take the place of those
     of the depth where they are known: they do not suffer from its noise.
@@ -216,7 +216,7 @@ class _Gathered:
 
 
 def select_voxels(voxels: Voxels, keep: NDArray[np.bool_]) -> Voxels:
-    """The voxels where `keep` (V,) is true."""
+    """Keep the voxels where `keep` (V,) is true."""
     return Voxels(
         voxels.size,
         voxels.keys[keep],

@@ -101,7 +101,7 @@ def find_moving_once(
     before: Mapping[int, NDArray[np.bool_]] = MappingProxyType({}),
     rules: Rules = _FIRST,
 ) -> dict[int, NDArray[np.bool_]]:
-    """One round of `find_moving` over some of the keyframes, with what the one before has found."""
+    """Do one round of `find_moving` over some of the keyframes, with what the one before has found."""
     view, found = lru_cache(_KEPT)(load), {}
     for k in progress.track(asked, "moving", len(asked)):
         depth = view(k).depth

@@ -40,7 +40,7 @@ class PeopleCards:
 
 
 def people_cards(store: ModelStore) -> PeopleCards | None:
-    """The networks in the cache, the smallest of each kind; None unless both are there."""
+    """Find the networks in the cache, the smallest of each kind; None unless both are there."""
     with_card = (m for m in store.models if "input" in store.families[m.family])
     here = sorted((m for m in with_card if store.is_here(m)), key=lambda m: m.bytes)
     cards = [store.card(m) for m in here]

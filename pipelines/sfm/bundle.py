@@ -172,8 +172,8 @@ class Problem:
     def reduced(
         self, at: tuple[Array, Array], normal: tuple[Array, ...], damping: float
     ) -> tuple[Array, Array, Array]:  # fmt: skip
-        """The system over the cameras alone: blocks (B, 6, 6) at `pairs`, the right side (6 N,), and the inverse blocks
-        (P, 3, 3) of the points that were eliminated."""
+        """Return the system over the cameras alone: blocks (B, 6, 6) at `pairs`, the right side (6 N,), and the inverse
+        blocks (P, 3, 3) of the points that were eliminated."""
         cam_block, cam_right, point_block, point_right = normal
         blocks, right = np.zeros((len(self.pairs), 6, 6)), cam_right.ravel().copy()
         diagonal = np.einsum("nii->ni", cam_block)

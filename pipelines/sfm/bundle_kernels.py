@@ -248,8 +248,8 @@ def invert_points(point_block, damping):  # type: ignore[no-untyped-def]
 def number_blocks(
     starts: NDArray[np.int64], obs_cam: NDArray[np.int64], count: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The pairs a <= b of cameras that share a point, row by row: those of camera a have the numbers from rows[a] to
-    rows[a + 1] (N + 1,), their second cameras, ascending, are columns (B,).
+    """Return the pairs a <= b of cameras that share a point, row by row: those of camera a have the numbers from
+    rows[a] to rows[a + 1] (N + 1,), their second cameras, ascending, are columns (B,).
 
     Sorting is left to numpy: numba takes ten seconds to compile a sort.
     """

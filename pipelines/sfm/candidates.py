@@ -293,7 +293,7 @@ if threading.current_thread() is threading.main_thread() and signal.getsignal(si
 def map_globally(
     database: Path, work: Path, refine_camera: bool, seed: int, tracks_per_view: int = _TRACKS
 ) -> pycolmap.Reconstruction | None:
-    """Poses of all images at once (Pan et al., Global Structure-from-Motion Revisited, ECCV 2024); None on failure."""
+    """Pose all images at once (Pan et al., Global Structure-from-Motion Revisited, ECCV 2024); None on failure."""
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     mapper = options.mapper
@@ -312,8 +312,8 @@ def map_globally(
 def map_incrementally(
     database: Path, work: Path, refine_camera: bool, seed: int, start: pycolmap.Reconstruction | None = None
 ) -> pycolmap.Reconstruction | None:
-    """Poses image by image (Schönberger and Frahm, Structure-from-Motion Revisited, CVPR 2016); None on failure. A
-    model of images in the database to `start` from keeps its poses; others are added to it."""
+    """Pose image by image (Schönberger and Frahm, Structure-from-Motion Revisited, CVPR 2016); None on failure. A model
+    of images in the database to `start` from keeps its poses; others are added to it."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     for part in (options, options.mapper, options.triangulation):

@@ -46,7 +46,7 @@ class PairCheck:
 
     @property
     def agrees(self) -> bool:
-        """Whether more than half of them do."""
+        """Return whether more than half of them do."""
         return self.agreeing > _PAIR_AGREES * self.matches
 
 
@@ -75,14 +75,14 @@ class Seam:
 
     @property
     def is_contradicted(self) -> bool:
-        """The images on the two sides match, and contradict their poses."""
+        """Return whether the images on the two sides match, and contradict their poses."""
         return self.pairs >= _MIN_PAIRS and self.agreement < _PAIR_AGREES
 
 
 def find_seams(
     placed: Sequence[int], checks: Iterable[PairCheck], tracks: Iterable[Sequence[int]], reach: int
 ) -> list[Seam]:
-    """All seams of the placed keyframes (sorted indices); keyframes more than `reach` places apart are no neighbours.
+    """Find the seams of the placed keyframes (sorted indices); those more than `reach` places apart are no neighbours.
 
     `tracks` are the keyframes (sorted indices) that see a point, for every point.
     """

@@ -82,7 +82,7 @@ class ModelReport:
 
     @property
     def largest(self) -> tuple[int, ...]:
-        """The part with most keyframes; empty where nothing is placed."""
+        """Return the part with most keyframes; empty where nothing is placed."""
         return self.components[0] if self.components else ()
 
     @property
@@ -99,17 +99,17 @@ class ModelReport:
 
     @property
     def is_whole(self) -> bool:
-        """Whether hardly any keyframe is missing."""
+        """Return whether hardly any keyframe is missing."""
         return len(self.largest) >= 0.95 * self.total
 
     @property
     def is_sound(self) -> bool:
-        """Whether the other mapper need not be asked: what another one finds of the rest is a piece beside this."""
+        """Return whether no other mapper need be asked: what it finds of the rest is a piece beside this."""
         return len(self.largest) >= 0.5 * self.total and self.is_consistent
 
     @property
     def is_consistent(self) -> bool:
-        """Whether what is placed agrees with the images."""
+        """Return whether what is placed agrees with the images."""
         return self.pairs_agreeing >= 0.9 and not self.contradicted and self.drift.factor < MAX_DRIFT
 
 
@@ -151,7 +151,7 @@ def check_pairs(
 def matched_errors(
     model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair], xy: Sequence[NDArray[np.float64]]
 ) -> Iterator[tuple[VerifiedPair, NDArray[np.float64]]]:
-    """The pairs of placed keyframes, with the distances (M,) of their matches to the epipolar lines in pixels."""
+    """Return the pairs of placed keyframes and their matches' distances (M,) to the epipolar lines in pixels."""
     camera = model.cameras[1]
     rays = {i - 1: np.asarray(camera.cam_from_img(xy[i - 1])) for i in model.reg_image_ids()}
     poses = {i: model.images[i + 1].cam_from_world().matrix() for i in rays}
@@ -192,9 +192,9 @@ def epipolar_error(
 
 
 def self_calibration_gain(model: pycolmap.Reconstruction) -> float:
-    """The share of the robust reprojection cost that goes when a held camera is adjusted with poses and points: its
-    focal lengths, and two radial coefficients where it states no distortion. The model stays as it is; its observations
-    are where frames taken at once would have them, for a free lens bends itself to a rolling shutter."""
+    """Return the share of the robust reprojection cost that goes when a held camera is adjusted with poses and points:
+    its focal lengths, and two radial coefficients where it states no distortion. The model stays as it is; its
+    observations are where frames taken at once would have them, for a free lens bends itself to a rolling shutter."""
     freed = pycolmap.Reconstruction(model)
     camera = freed.cameras[1]
     bends = not any(distortion_of(camera))

@@ -93,7 +93,7 @@ def compute_global_descriptors(
 
 
 def learn_vocabulary(features: Sequence[Features], seed: int) -> Vocabulary:
-    """The words of these frames by k-means, and the mean of their descriptors."""
+    """Learn the words of these frames by k-means, and the mean of their descriptors."""
     rng = np.random.default_rng(seed)
     share = max(1, _TRAINING_DESCRIPTORS // max(1, len(features)))
     samples = [f.descriptors[rng.permutation(len(f))[:share]] for f in features]
@@ -149,7 +149,7 @@ def _products(some: NDArray[np.float32], vectors: NDArray[np.float32]) -> NDArra
 
 
 def sequential_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
-    """All (i, j) with i < j <= i + overlap, and j = i + 2^k beyond it up to four times as far."""
+    """Return all (i, j) with i < j <= i + overlap, and j = i + 2^k beyond it up to four times as far."""
     steps = list(range(1, overlap + 1))
     steps += [s for s in (overlap * 2, overlap * 4) if s > overlap]
     return [(i, i + s) for i in range(count) for s in steps if i + s < count]

@@ -83,8 +83,8 @@ def _flow(
 def find_corners(
     grey: NDArray[np.uint8], taken: Array, count: int, distance: float = 10.0, left_out: NDArray[np.bool_] | None = None
 ) -> Array:
-    """Up to `count` new corners (Q, 2), subpixel, none within `distance` pixels of those taken (R, 2) or each other,
-    and none in a mask (H, W)."""
+    """Find up to `count` new corners (Q, 2), subpixel, none within `distance` pixels of those taken (R, 2) or each
+    other, and none in a mask (H, W)."""
     if count <= 0:  # OpenCV takes 0 for "as many as there are"
         return np.zeros((0, 2))
     mask = np.full(grey.shape, 255, np.uint8)

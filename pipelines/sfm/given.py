@@ -49,7 +49,7 @@ class GivenFit:
 
     @property
     def is_contradiction(self) -> bool:
-        """Whether the two have so little in common that they cannot be poses of the same images."""
+        """Return whether the two have so little in common that they cannot be poses of the same images."""
         return self.degrees_sd > _APART_DEGREES or self.position_sd > _APART_SHARE * self.extent
 
 

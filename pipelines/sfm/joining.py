@@ -53,8 +53,8 @@ class Joined:
     seen: dict[tuple[int, int], int] = field(default_factory=dict)
 
     def add(self, model: pycolmap.Reconstruction, first: int) -> bool:
-        """One more model, of images counted from `first`, moved by a similarity to where it shares images and points
-        with the one before; False where these are too few."""
+        """Add one more model, of images counted from `first`, moved by a similarity to where it shares images and
+        points with the one before; False where these are too few."""
         points = {p: model.points3D[p] for p in sorted(model.point3D_ids())}
         tracks = {p: [(first + e.image_id, e.point2D_idx) for e in q.track.elements] for p, q in points.items()}
         known = {p: self.seen[o] for p, track in tracks.items() for o in reversed(track) if o in self.seen}
@@ -94,8 +94,8 @@ class Joined:
 
 
 def align_views(source: Array, target: Array, source_points: Array, target_points: Array) -> Similarity:
-    """The similarity that takes cameras cam_from_source (N, 4, 4) and the points (P, 3) they see to cam_from_target and
-    where these points are there: rotation by all axes of the cameras, then medians, for points may be far off."""
+    """Fit the similarity that takes cameras cam_from_source (N, 4, 4) and the points (P, 3) they see to cam_from_target
+    and where these points are there: rotation by all axes of the cameras, then medians, for points may be far off."""
     rotation = best_rotation(source[:, :3, :3].reshape(-1, 3), target[:, :3, :3].reshape(-1, 3))
     centers, wanted = se3.inverse(source)[:, :3, 3], se3.inverse(target)[:, :3, 3]
     away, there = (
@@ -140,7 +140,7 @@ def adjust_joined(
     model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout, pairs: Iterable[VerifiedPair],
     windows: Sequence[range], narrowly: bool, find_readout: bool = False,
 ) -> Readout:  # fmt: skip
-    """The joined windows adjusted as one, with the loops between them, in place; `narrowly` as of `adjust`. Returns the
+    """Adjust the joined windows as one, with the loops between them, in place; `narrowly` as of `adjust`. Returns the
     readout: that given, or with `find_readout` what all keyframes together tell."""
     adjust_together(model, xy, times, readout)
     if merge_loop_points(model, pairs, windows, xy):
@@ -155,8 +155,8 @@ def adjust_joined(
 
 
 def found_readout(model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, start: Readout) -> Readout:
-    """The readout of a model, from a first guess; none where it explains too little. The model is adjusted with it, in
-    place."""
+    """Find the readout of a model from a first guess; none where it explains too little. The model is adjusted with it,
+    in place."""
     seconds = math.hypot(*start)
     axis, share = (start[0] / seconds, start[1] / seconds), 0.0
     for _ in range(_READOUT_ROUNDS):
@@ -175,7 +175,7 @@ def found_readout(model: pycolmap.Reconstruction, xy: Sequence[Array], times: Ar
 def adjust_together(
     model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout, width: float = 2.0
 ) -> None:  # fmt: skip
-    """Poses and points adjusted in place, with the camera as it is; see `adjust_bundle` for the width of the loss."""
+    """Adjust poses and points in place, with the camera as it is; see `adjust_bundle` for the width of the loss."""
     rolling = RollingModel(model, xy, times)
     images, point_ids = rolling.arrays.image_ids.tolist(), rolling.arrays.point_ids.tolist()
     bundle, plain, pinhole = rolling.bundle()
@@ -264,8 +264,8 @@ def repair_scale_breaks(
     model: pycolmap.Reconstruction, report: ModelReport, pairs: Sequence[VerifiedPair], xy: Sequence[Array],
     total: int, reach: int, seed: int,
 ) -> tuple[pycolmap.Reconstruction, ModelReport]:  # fmt: skip
-    """The model with both sides of its weak links at one scale, where enough matched features give it and the result
-    has fewer components without agreeing less; else as it is. Arguments as of `judge`."""
+    """Return the model with both sides of its weak links at one scale, where enough matched features give it and the
+    result has fewer components without agreeing less; else as it is. Arguments as of `judge`."""
     for seam in [s for s in report.seams if s.is_weak_link]:
         owner = {k: n for n, component in enumerate(report.components) for k in component}
         if {owner[k] for k in owner if k <= seam.before} & {owner[k] for k in owner if k >= seam.after}:

@@ -20,7 +20,7 @@ _MIN_SHIFT_PX = 0.3
 
 
 def to_pycolmap(camera: Camera) -> pycolmap.Camera:
-    """A fixed camera with known intrinsics: OPENCV with distortion, FULL_OPENCV with more than two radial ones,
+    """Make a fixed camera with known intrinsics: OPENCV with distortion, FULL_OPENCV with more than two radial ones,
     PINHOLE, or OPENCV_FISHEYE."""
     params = [camera.fx, camera.fy, camera.cx, camera.cy]
     model = "PINHOLE"
@@ -40,14 +40,14 @@ def to_pycolmap(camera: Camera) -> pycolmap.Camera:
 
 
 def unknown_camera(width: int, height: int, focal: float, is_prior: bool) -> pycolmap.Camera:
-    """A camera to be calibrated: one focal length, the image centre, one radial coefficient."""
+    """Make a camera to be calibrated: one focal length, the image centre, one radial coefficient."""
     made = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, width, height)
     made.has_prior_focal_length = is_prior
     return made
 
 
 def calibrated_camera(known: Calibration) -> pycolmap.Camera:
-    """The distorted camera that a calibration is of, with the same radial coefficients, to be calibrated on."""
+    """Return the distorted camera that a calibration is of, with the same radial coefficients, to be calibrated on."""
     pinhole = known.intrinsics
     camera = unknown_camera(pinhole.width, pinhole.height, pinhole.fx, is_prior=True)
     set_lens(camera, 2 if known.distortion[1] else 1)
@@ -93,7 +93,7 @@ class Lens:
 
     @property
     def is_straight(self) -> bool:
-        """Whether there is too little distortion to take away."""
+        """Return whether there is too little distortion to take away."""
         return self.shift_px <= _MIN_SHIFT_PX
 
     def undistort_points(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -132,7 +132,7 @@ class Lens:
 
 
 def make_lens(camera: pycolmap.Camera) -> Lens:
-    """The lens of a calibrated camera."""
+    """Make the lens of a calibrated camera."""
     same = Intrinsics(
         camera.width, camera.height, camera.focal_length_x, camera.focal_length_y,
         camera.principal_point_x, camera.principal_point_y,
@@ -208,7 +208,7 @@ class FramePixels:
 
 
 def distorted_camera(calibration: Calibration) -> Camera:
-    """The lens before undistortion, which may have enlarged the image to fill the frame."""
+    """Return the lens before undistortion, which may have enlarged the image to fill the frame."""
     k, zoom = calibration.intrinsics, 1.0
     for _ in range(6):
         camera = Camera(

@@ -55,12 +55,12 @@ class Shutter:
 
     @property
     def is_rolling(self) -> bool:
-        """Whether rows are taken one after the other."""
+        """Return whether rows are taken one after the other."""
         return any(self.readout)
 
 
 def read_readout(text: str) -> Readout | None:
-    """The setting `frames.rolling_shutter`: None for auto. Raises InputError for what is no time."""
+    """Parse the setting `frames.rolling_shutter`: None for auto. Raises InputError for what is no time."""
     if text == "auto":
         return None
     try:
@@ -101,8 +101,8 @@ def velocities(cam_from_world: Array, times: Array, worlds: NDArray[np.int64] | 
 
 
 def rectified_bundle(bundle: Bundle, xy: Array, camera: Intrinsics, velocity: Array, readout: Readout) -> Bundle:
-    """The bundle with its observations where they would be in frames taken at once; xy (O, 2) are those in the frames,
-    velocity (N, 6) those of its cameras."""
+    """Return the bundle with its observations where they would be in frames taken at once; xy (O, 2) are those in the
+    frames, velocity (N, 6) those of its cameras."""
     seen = bundle.obs_cam, bundle.obs_point
     return replace(
         bundle, obs_xy=xy - _moved(bundle.cam_from_world, bundle.points, seen, xy, camera, velocity, readout)
@@ -126,8 +126,8 @@ def _moved(
 
 
 def estimate(bundle: Bundle, xy: Array, camera: Intrinsics, times: Array, direction: Readout) -> tuple[float, float]:
-    """By how much the readout in this `direction` (of one second) should grow, and the share of the robust cost that a
-    second of it makes: it grows by the square. See `rectified_bundle` for the arguments.
+    """Estimate by how much the readout in this `direction` (of one second) should grow, and the share of the robust
+    cost that a second of it makes: it grows by the square. See `rectified_bundle` for the arguments.
 
     One Gauss-Newton step of it together with all poses and points, which are eliminated. Since observations far off
     weigh less, it falls short by a fixed share, and is repeated.
@@ -202,7 +202,7 @@ class RollingModel:
 def straight_copy(
     model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout
 ) -> pycolmap.Reconstruction:
-    """The model with its observations where they would be in frames taken at once; the one given stays as it is."""
+    """Copy the model with its observations where they would be in frames taken at once."""
     rolling = RollingModel(pycolmap.Reconstruction(model), xy, times)
     if any(readout):
         rolling.rectify_observations(*rolling.bundle(), readout)
@@ -227,7 +227,7 @@ class ReadoutEvidence:
 
     @property
     def is_convincing(self) -> bool:
-        """Whether the observations are explained better by a path that is not bent."""
+        """Return whether the observations are explained better by a path that is not bent."""
         return self.held_out_gain > MIN_HELD_OUT_GAIN and self.scale_change < MAX_SCALE_CHANGE
 
 
@@ -281,10 +281,10 @@ def adjust_rolling(
     model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout | None, refine_camera: bool,
     narrowly: bool = False, longest: float = LONGEST_STEP,
 ) -> tuple[pycolmap.Reconstruction, Readout, float] | None:  # fmt: skip
-    """The model adjusted with the `readout` given, or found where it is None, and the standard deviation of its focal
-    length; None where there is no readout, or where the one found is longer than the `longest` possible (seconds),
-    explains too little, or bends the path. The model given stays as it is, and pixels are those in the frames before
-    and after."""
+    """Return the model adjusted with the `readout` given, or found where it is None, and the standard deviation of its
+    focal length; None where there is no readout, or where the one found is longer than the `longest` possible
+    (seconds), explains too little, or bends the path. The model given stays as it is, and pixels are those in the
+    frames before and after."""
     if readout is not None and not any(readout):
         return None
     rolling = RollingModel(pycolmap.Reconstruction(model), xy, times)

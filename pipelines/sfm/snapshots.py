@@ -46,7 +46,7 @@ class Snapshots:
         return Snapshots(folder)
 
     def value(self, name: str, compute: Callable[[], T]) -> T:
-        """A value, computed unless it is stored."""
+        """Return a value, computed unless it is stored."""
         path = self.folder / f"{name}.npz"
         if path.exists():
             stored: T = load_value(path)
@@ -58,7 +58,7 @@ class Snapshots:
     def model(
         self, name: str, compute: Callable[[Path], pycolmap.Reconstruction | None]
     ) -> pycolmap.Reconstruction | None:
-        """A reconstruction, computed in a scratch folder unless it is stored; None where there is none.
+        """Return a reconstruction, computed in a scratch folder unless it is stored; None where there is none.
 
         It is always read back from disk: the order in memory of a fresh model and of one read differ, and with it the
         order in which an adjustment adds.

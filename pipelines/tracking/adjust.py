@@ -62,7 +62,7 @@ class Report:
 
 
 def without_dependent_depth(settings: TrackingConfig, proxy_report: Mapping[str, Any]) -> TrackingConfig:
-    """The settings, `use_depth` off where the proxies were made from the same images: nothing new about the poses."""
+    """Return the settings, `use_depth` off where the proxies were made from the same images."""
     independent = proxy_report.get("independent_depth", proxy_report.get("metric", False))
     return settings if independent else replace(settings, use_depth=False)
 
@@ -139,7 +139,7 @@ def drop_loose(
 def undo_rolling_shutter(
     bundle: Bundle, in_frame: Array, frame_ids: list[int], state: TrackState, intrinsics: Intrinsics
 ) -> Bundle:
-    """The bundle with the pixels (O, 2) at which its frames see their points, but for what a rolling shutter adds."""
+    """Return the bundle with its pixels in the frames (O, 2), less what a rolling shutter adds."""
     shutter = state.shutter
     if not shutter.is_rolling:
         return bundle
@@ -149,14 +149,14 @@ def undo_rolling_shutter(
 
 
 def align_depths(model: SparseModel, report: Report, intrinsics: Intrinsics, load_proxy: LoadProxy) -> DepthFields:
-    """The fields of all keyframes in the world of `model`, which the reported adjustment has made."""
+    """Fit the depth fields of all keyframes in the world of `model`, which the reported adjustment has made."""
     ties = report.ties
     known = {i: scales.as_fine(ties.fields[c]) for c, i in enumerate(report.frame_ids) if ties.has_depth[c]}
     return align_keyframes(model, intrinsics, load_proxy, known)
 
 
 def make_bundle(state: TrackState, frame_ids: list[int]) -> Bundle:
-    """All sightings of the given frames, in their order; points seen only once are left out."""
+    """Bundle all sightings of the given frames, in their order; points seen only once are left out."""
     cam, seen = state.shared_sightings(frame_ids)
     poses, zeros = np.array([state.poses[i] for i in frame_ids]), np.zeros(len(seen))
     # The last one stands for those of no source.
@@ -211,7 +211,7 @@ def set_scale(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics) -> Bundle
 
 
 def with_depths(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics, settings: TrackingConfig) -> Bundle:
-    """The bundle with the rescaled proxy depths as its depth observations.
+    """Return the bundle with the rescaled proxy depths as its depth observations.
 
     Proxies that were made from the same images say nothing new about the poses: without metres, or with
     `use_depth` off, they are left out.

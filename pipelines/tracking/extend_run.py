@@ -40,7 +40,7 @@ a rendered room, which is told from itself enlarged by 1.3."""
 
 
 def is_added(run: RunFolder, videos: Sequence[Path]) -> bool:
-    """Whether the run's last extension, finished or not, was by exactly these videos."""
+    """Return whether the run's last extension, finished or not, was by exactly these videos."""
     source = Path(load_source(run).path)
     added = [video.resolve() for video in videos]
     return source.parent.name.startswith(EXTENSION) and list(video_files(source))[-len(added) :] == added

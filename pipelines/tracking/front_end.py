@@ -88,7 +88,7 @@ class FrontEnd:
         return seen, self.solve(frame_id, seen, start), start
 
     def is_inside(self, frame_id: int) -> bool:
-        """Whether keyframes of one segment are on both sides: then there is no need for new ones."""
+        """Return whether keyframes of one segment are on both sides: then there is no need for new ones."""
         nearest = self.state.nearest_keyframes(frame_id, 1)
         if len(nearest) < 2 or abs(nearest[0] - nearest[1]) >= REACH:
             return False
@@ -132,7 +132,7 @@ class FrontEnd:
         return seen
 
     def solve(self, frame_id: int, seen: Sightings, start: Array | None) -> FramePose | None:
-        """The pose that most of the sightings agree on."""
+        """Find the pose that most of the sightings agree on."""
         points = self.state.points[seen.point]
         return solve_pose(seen.xy, points, self.pictures.intrinsics, self.seed + frame_id, start)
 
@@ -207,8 +207,8 @@ def turn_between(first: int, second: int, pictures: Pictures, seed: int) -> Arra
 def fit_rotation(
     xy1: Array, xy2: Array, camera: Intrinsics, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """The rotation (3, 3) of the camera that most of the matched pixels (M, 2) obey, and which (M,): RANSAC over pairs
-    of matches."""
+    """Fit the rotation (3, 3) of the camera that most of the matched pixels (M, 2) obey, and which (M,): RANSAC over
+    pairs of matches."""
     pairs = rng.integers(0, len(xy1), (_TRIALS, 2))
     rays1, rays2 = _rays(xy1, camera), _rays(xy2, camera)
     tried = [best_rotation(rays1[p], rays2[p]) for p in pairs]
@@ -246,7 +246,8 @@ def promote(frame_id: int, state: TrackState, pictures: Pictures) -> int:
 
 
 def start_segment(frame_id: int, cam_from_world: Array, state: TrackState, pictures: Pictures) -> bool:
-    """A new beginning from one frame's proxy depth; False, and nothing changed, when it has too few points for that."""
+    """Begin anew from one frame's proxy depth; return False, with nothing changed, when it has too few points for
+    that."""
     if pictures.proxy(frame_id) is None:
         return False
     before = len(state.points)

@@ -169,7 +169,7 @@ def _apart(first: Array, second: Array, depth: float) -> bool:
 
 
 def match_keyframe(frame_id: int, keyframe: int, state: TrackState, pictures: Pictures) -> Sightings:
-    """The keyframe's points found in the frame by SIFT; the frame's pixels are good to about one."""
+    """Find the keyframe's points in the frame by SIFT; the frame's pixels are good to about one."""
     known = state.sightings[keyframe]
     if len(known) == 0:
         return NO_SIGHTINGS

@@ -125,7 +125,8 @@ def _depth_ratio(frame_id: int, cam_from_main: Array, seen: Sightings, state: Tr
 
 
 def agree(first: Similarity, second: Similarity, cam_from_world: Array, depth: float) -> bool:
-    """Whether both put this camera in nearly the same place: 3 degrees, a tenth of the depth it sees, a tenth of scale.
+    """Return whether both put this camera in nearly the same place: 3 degrees, a tenth of the depth it sees, a tenth of
+    scale.
 
     `depth` is in the unit that both similarities start from. Where either world has its origin does not matter.
     """
@@ -139,7 +140,7 @@ def agree(first: Similarity, second: Similarity, cam_from_world: Array, depth: f
 
 
 def move_segment(segment: int, main: int, main_from_segment: Similarity, state: TrackState) -> None:
-    """Poses and points of a segment into the main one's world."""
+    """Move poses and points of a segment into the main one's world."""
     frames = [i for i in sorted(state.poses) if state.segment[i] == segment]
     points = np.unique(np.concatenate([state.sightings[i].point for i in frames]))
     state.points[points] = main_from_segment.apply(state.points[points])

@@ -92,7 +92,7 @@ class TrackState:
     def from_backbone(
         model: SparseModel, sd: float, rig: Rig = ONE_CAMERA, shutter: Shutter | None = None
     ) -> TrackState:
-        """The keyframes and points of structure from motion as segment 0."""
+        """Take the keyframes and points of structure from motion as segment 0."""
         state = TrackState(model.points_in_world.copy(), model.colors.copy(), rig=rig, shutter=shutter or Shutter())
         for k, frame_id in enumerate(int(i) for i in model.frame_ids):
             mine = model.observations_of(k)
@@ -103,7 +103,7 @@ class TrackState:
     def add_frame(
         self, frame_id: int, cam_from_world: Array, sightings: Sightings, is_keyframe: bool, segment: int
     ) -> None:
-        """A posed frame; its sightings count each point once."""
+        """Add a posed frame; its sightings count each point once."""
         _, first = np.unique(sightings.point, return_index=True)
         self.poses[frame_id] = np.asarray(cam_from_world, dtype=np.float64)
         self.sightings[frame_id] = sightings.select(np.sort(first))
@@ -123,7 +123,7 @@ class TrackState:
                 listed.remove(frame_id)
 
     def add_segment(self, other: TrackState) -> None:
-        """The keyframes of another world that are not posed yet, with their points, as a segment of their own."""
+        """Add the keyframes of another world that are not posed yet, with their points, as a segment of their own."""
         first = self.add_points(other.points, other.colors)[:1]
         segment = max(self.segment.values(), default=-1) + 1
         for k in (k for k in other.keyframes if k not in self.poses):
@@ -138,13 +138,13 @@ class TrackState:
         return np.arange(first, len(self.points))
 
     def segment_of_point(self, point: int, frame_id: int) -> int:
-        """The segment of the keyframes that see a point; `frame_id` is near them, as a rule."""
+        """Return the segment of the keyframes that see a point; `frame_id` is near them, as a rule."""
         nearest = self.nearest_keyframes(frame_id, _NEAR_KEYFRAMES)
         return next(self.segment[k] for k in chain(nearest, self.keyframes) if point in self.sightings[k].point)
 
     def shared_sightings(self, frame_ids: Sequence[int]) -> tuple[NDArray[np.int64], Sightings]:
-        """The sightings of these frames, one frame's after the other's, of points that at least two of them see; and
-        (O,) which of the frames each is of."""
+        """Return the sightings of these frames, one frame's after the other's, of points that at least two of them see;
+        and (O,) which of the frames each is of."""
         rows = [self.sightings[i] for i in frame_ids]
         row = np.repeat(np.arange(len(rows)), [len(r) for r in rows])
         seen = Sightings(*(np.concatenate([getattr(r, f.name) for r in rows]) for f in fields(Sightings)))
@@ -172,7 +172,7 @@ class TrackState:
         return float(np.median(depth)) if len(depth) else 1.0
 
     def nearest_keyframes(self, frame_id: int, count: int) -> list[int]:
-        """Up to `count` keyframes on each side in time, nearest first."""
+        """Return up to `count` keyframes on each side in time, nearest first."""
         place, behind = bisect_left(self.keyframes, frame_id), bisect_right(self.keyframes, frame_id)
         before, after = self.keyframes[max(place - count, 0) : place], self.keyframes[behind : behind + count]
         return sorted(before + after, key=lambda k: (abs(k - frame_id), k))
@@ -198,8 +198,9 @@ def sync_rig_poses(state: TrackState) -> None:
 
 
 def split_worlds(state: TrackState, least: int) -> list[TrackState]:
-    """The segments, largest first, each in a world of its own that begins with its first posed camera; of those after
-    the first, the ones of at least so many frames. The first has the reason why a frame is in none or in another."""
+    """Return the segments, largest first, each in a world of its own that begins with its first posed camera; of those
+    after the first, the ones of at least so many frames. The first has the reason why a frame is in none or in
+    another."""
     counts = state.segment_sizes()
     order = list(counts)
     kept = order[:1] + [s for s in order[1:] if counts[s] >= least]
@@ -228,7 +229,7 @@ def _in_own_world(state: TrackState, segment: int) -> TrackState:
 
 
 def to_trajectory(state: TrackState, frames: list[Frame]) -> Trajectory:
-    """All frames, posed or with the reason why not."""
+    """Return all frames, posed or with the reason why not."""
     keyframes = set(state.keyframes)
     return Trajectory(
         frame_ids=np.array([f.id for f in frames], np.int64),
