@@ -41,61 +41,20 @@ def map_lookahead(function: Callable[[T], R], items: Iterable[T], threads: int) 
 
 
 class LruCache(Generic[K, R]):
-    """The values of `make` for the keys asked for last, at most `limit` of them; a thread that asks for one that
-    another is making waits for it. `make` may ask others of its kind, but not itself in a circle."""
+    """The values of `make` for the keys asked for last, kept while their sizes add up to at most `room`.
 
-    def __init__(self, make: Callable[[K], R], limit: int) -> None:
-        self._make, self._limit = make, limit
-        self._kept: OrderedDict[K, Future[R]] = OrderedDict()
-        self._lock = Lock()
-
-    def __call__(self, key: K) -> R:
-        with self._lock:
-            value = self._kept.get(key)
-            is_new = value is None
-            if value is None:
-                value = self._kept[key] = Future()
-            self._kept.move_to_end(key)
-            while len(self._kept) > self._limit:
-                self._kept.popitem(last=False)
-        if is_new:
-            self._fill(key, value)
-        return value.result()
-
-    def _fill(self, key: K, value: Future[R]) -> None:
-        try:
-            value.set_result(self._make(key))
-        except BaseException as error:
-            with self._lock:  # asked for again it is tried again
-                if self._kept.get(key) is value:
-                    del self._kept[key]
-            value.set_exception(error)
-
-
-class LruSequence(Sequence[T], Generic[T]):
-    """The values of `make` for 0 to `count` - 1, those used last kept while they need at most `room` bytes together.
-
-    `make` gives the same value whenever it is called with the same number. May be asked from several threads.
+    A thread that asks for a value that another is making waits for it. `make` may ask others of its kind, but not
+    itself in a circle; what it raises is not kept.
     """
 
-    def __init__(self, count: int, make: Callable[[int], T], size_of: Callable[[T], int], room: float) -> None:
-        self._count, self._make, self._size_of, self._room = count, make, size_of, room
-        self._kept: OrderedDict[int, T] = OrderedDict()
+    def __init__(self, make: Callable[[K], R], room: float, size_of: Callable[[R], int] = lambda value: 1) -> None:
+        self._make, self._size_of, self._room = make, size_of, room
+        self._kept: OrderedDict[K, R] = OrderedDict()
         self._used = 0
         self._lock = Lock()
-        self._making: dict[int, Lock] = {}
+        self._making: dict[K, Lock] = {}
 
-    def __len__(self) -> int:
-        return self._count
-
-    @overload
-    def __getitem__(self, index: int) -> T: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[T]: ...
-    def __getitem__(self, index: int | slice) -> T | list[T]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(self._count)[index]]
-        key = range(self._count)[index]  # raises IndexError, counts from the end
+    def __call__(self, key: K) -> R:
         with self._lock:
             making = self._making.setdefault(key, Lock())
         with making:  # made once; other values are made meanwhile
@@ -107,21 +66,59 @@ class LruSequence(Sequence[T], Generic[T]):
             self.keep(key, value)
             return value
 
-    def keep(self, index: int, value: T) -> None:
+    def keep(self, key: K, value: R) -> None:
         """Take a value that is at hand, the one that `make` would make."""
         with self._lock:
-            if index in self._kept:
-                self._used -= self._size_of(self._kept.pop(index))
-            self._kept[index] = value
+            if key in self._kept:
+                self._used -= self._size_of(self._kept.pop(key))
+            self._kept[key] = value
             self._used += self._size_of(value)
             while self._used > self._room and len(self._kept) > 1:
                 self._used -= self._size_of(self._kept.popitem(last=False)[1])
 
-    def forget(self) -> None:
-        """Keep nothing until it is asked for again: what comes now needs the memory."""
+    def clear(self) -> None:
+        """Keep nothing until it is asked for again."""
         with self._lock:
             self._kept.clear()
             self._used = 0
+
+    def take_over(self, other: LruCache[K, R], function: Callable[[K, R], R]) -> None:
+        """Keep `function`(key, value) of what the other keeps, which gives it up one by one."""
+        while other._kept:
+            key, value = other._kept.popitem(last=False)
+            self._kept[key] = function(key, value)
+        self._used, other._used = other._used, 0
+
+
+class LruSequence(Sequence[T], Generic[T]):
+    """The values of `make` for 0 to `count` - 1, those used last kept while they need at most `room` bytes together.
+
+    `make` gives the same value whenever it is called with the same number. May be asked from several threads.
+    """
+
+    def __init__(self, count: int, make: Callable[[int], T], size_of: Callable[[T], int], room: float) -> None:
+        self._count, self._make, self._size_of, self._room = count, make, size_of, room
+        self._cache = LruCache(make, room, size_of)
+
+    def __len__(self) -> int:
+        return self._count
+
+    @overload
+    def __getitem__(self, index: int) -> T: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[T]: ...
+    def __getitem__(self, index: int | slice) -> T | list[T]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(self._count)[index]]
+        return self._cache(range(self._count)[index])  # raises IndexError, counts from the end
+
+    def keep(self, index: int, value: T) -> None:
+        """Take a value that is at hand, the one that `make` would make."""
+        self._cache.keep(index, value)
+
+    def forget(self) -> None:
+        """Keep nothing until it is asked for again: what comes now needs the memory."""
+        self._cache.clear()
         release_free_memory()
 
     def part(self, numbers: range) -> LruSequence[T]:
@@ -132,8 +129,5 @@ class LruSequence(Sequence[T], Generic[T]):
         """Return a sequence of `function`(number, value); takes over the cached values and the memory limit."""
         make = self._make
         other = LruSequence(self._count, lambda i: function(i, make(i)), self._size_of, self._room)
-        while self._kept:
-            key, value = self._kept.popitem(last=False)
-            other._kept[key] = function(key, value)
-        other._used, self._used = self._used, 0
+        other._cache.take_over(self._cache, function)
         return other
