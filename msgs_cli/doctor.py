@@ -166,13 +166,13 @@ def _gpu() -> Finding:
 
     from ..pipelines.system.machine import unused_card
 
+    if unused := unused_card():
+        return Finding("gpu", NOTE, *unused)
     if torch.cuda.is_available():
         properties = torch.cuda.get_device_properties(0)
         return Finding(
             "gpu", GOOD, f"{properties.name}, {properties.total_memory / 1e9:.0f} GB; --device auto takes it"
         )
-    if unused := unused_card():
-        return Finding("gpu", NOTE, *unused)
     return Finding("gpu", GOOD, "none; everything runs on the CPU")
 
 

@@ -137,7 +137,7 @@ def main() -> None:
     msgs-slam demo                      try it on a small synthetic room (about 4 minutes on two cores)
     msgs-slam reconstruct video.mp4     the whole job; writes video.msgs/
     msgs-slam resume video.msgs         resume an interrupted run
-    msgs-slam extend RUN more.mp4       extend a finished run with another video; its map is kept
+    msgs-slam extend RUN more.mp4       extend a finished run with another video
     msgs-slam batch FOLDER --out RUNS   many recordings, on one machine or many
     msgs-slam status video.msgs         what is done, what was found
     msgs-slam export video.msgs         write the export files again, or elsewhere
@@ -249,10 +249,9 @@ def resume_command(
 def extend_command(run_path: Path, videos: tuple[Path, ...], output: Output) -> None:
     """Add VIDEO, by the same camera and of the same place, to the finished RUN.
 
-    First a few of its images are searched for in the run: if nothing matches or the camera differs, it stops and
-    changes nothing. Then its frames join those of the run, whose poses are the start, all are adjusted together, and
-    the map is grown where the added frames look. Coordinates stay what they were, as near as the adjustment allows.
-    Stopped, the same command or `msgs-slam resume RUN` goes on.
+    The run is made anew from all its videos, with its poses given, as by --poses: all are adjusted together, and the
+    result is moved onto them, so that coordinates stay what they were, as near as the adjustment allows. Stopped, the
+    same command or `msgs-slam resume RUN` goes on.
 
     \b
     Example: msgs-slam extend video.msgs kitchen.mp4

@@ -34,7 +34,7 @@ def all_stages(method: str = "default") -> list[Stage]:
         Stage("global_ba", Later("global_ba.stage")),
     ]
     if method == "paper":
-        names = {"tracking": "track", "mapping": "map_keyframes", "global_ba": "close_and_adjust"}
+        names = {"tracking": "track_by_map", "mapping": "map_keyframes", "global_ba": "close_and_adjust"}
         between = [Stage(stage, Later("paper.stages", name)) for stage, name in names.items()]
     return [
         Stage("frames", Later("frames.stage"), check_frames, frames_division),
@@ -163,18 +163,18 @@ def extend(run: RunFolder, videos: Sequence[Path], progress: Progress) -> dict[s
     """Add videos by the same camera to a finished run: see `docs/adding.md`. Stopped once it has begun, the same
     call or `resume` goes on.
 
-    Raises InputError, with nothing changed, for a run that is not finished, another camera, and a video in which
-    nothing of the run is recognised.
+    Raises InputError, with nothing changed, for a run that is not finished or not of plain videos, and for a video of
+    another size.
     """
     require_run(run)
-    from .tracking.extend_run import add_videos, is_added, require_extendable
+    from .source.extending import add_videos, is_added, require_extendable
 
     if run.is_piece or is_added(run, videos):
         return resume(run, progress)
     with locked(run):
         config = load_settings(run)
         require_device(config.run.device)
-        require_extendable(run, videos, config, progress)
+        require_extendable(run, videos, config)
         source = add_videos(run, videos, config)
         return _run(run, Path(source.path), source.digest, config, progress, STAGES[-1], None)
 

@@ -17,10 +17,12 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 from msgs_slam.pipelines import outcome
+from msgs_slam.pipelines.compute import adam, gpu
 from msgs_slam.pipelines.mapping import submap_tasks
 from msgs_slam.pipelines.render import api, cpu, inspection
-from msgs_slam.pipelines.render.notes import Notes
+from msgs_slam.pipelines.render.rules import GaussianStats
 from msgs_slam.pipelines.run import stages
+from tests.plain_adam import plain_descend
 
 DEVICE = "meta"
 _COPIES = {torch.ops.aten.copy_.default, torch.ops.aten._to_copy.default}
@@ -130,7 +132,7 @@ class PretendBackend:
 
     @staticmethod
     def composite(*arguments: Any) -> tuple[torch.Tensor, ...]:
-        """As a backend's: six tensors, width, height, the least depth, and notes or None."""
+        """As a backend's: six tensors, width, height, the least depth, and stats or None."""
         values = [_taken(x) for x in arguments[:6]]
         return _Composite.apply(arguments[6:], *values)
 
@@ -155,22 +157,22 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rest: tuple[Any, ...], *values: PretendTensor) -> tuple[torch.Tensor, ...]:
         ctx.inputs = [v.inner.detach().contiguous().requires_grad_() for v in values]
-        *size, ctx.notes = rest
-        counted = None if ctx.notes is None else ctx.notes.counted
-        ctx.inner_notes = None if ctx.notes is None else Notes(None if counted is None else counted.inner)
+        *size, ctx.stats = rest
+        counted = None if ctx.stats is None else ctx.stats.counted
+        ctx.inner_stats = None if ctx.stats is None else GaussianStats(None if counted is None else counted.inner)
         with torch.enable_grad():
-            ctx.outputs = cpu.composite(*ctx.inputs, *size, ctx.inner_notes)
+            ctx.outputs = cpu.composite(*ctx.inputs, *size, ctx.inner_stats)
         return tuple(PretendTensor(x.detach()) for x in ctx.outputs)
 
     @staticmethod
     def backward(ctx: Any, *gradients: PretendTensor) -> tuple[Any, ...]:
         given = [g.inner.contiguous() for g in gradients]
-        if ctx.notes is not None:
-            ctx.inner_notes.errors = ctx.notes.errors.inner
+        if ctx.stats is not None:
+            ctx.inner_stats.errors = ctx.stats.errors.inner
         found = torch.autograd.grad(ctx.outputs, ctx.inputs, given, allow_unused=True)
-        if ctx.notes is not None:
-            noted = (ctx.inner_notes.largest, ctx.inner_notes.answered)
-            ctx.notes.largest, ctx.notes.answered = (PretendTensor(x) for x in noted)
+        if ctx.stats is not None:
+            noted = (ctx.inner_stats.largest, ctx.inner_stats.error_share)
+            ctx.stats.largest, ctx.stats.error_share = (PretendTensor(x) for x in noted)
         return (None, *(None if g is None else PretendTensor(g) for g in found))
 
 
@@ -184,6 +186,13 @@ def pretended(patch: pytest.MonkeyPatch) -> Iterator[str]:
 
     patch.setattr(api, "choose_backend", choose)
     patch.setattr(inspection, "choose_backend", choose)
+    descend = adam.descend
+
+    def step(value: torch.Tensor, *rest: Any) -> None:
+        is_plain = isinstance(value, PretendTensor) and not gpu.supports_triton(value)
+        (plain_descend if is_plain else descend)(value, *rest)
+
+    patch.setattr(adam, "descend", step)
     for user in (outcome, stages, submap_tasks):
         patch.setattr(user, "resolve_device", lambda wanted="auto": DEVICE)
     patch.setattr(torch.autograd, "_engine_run_backward", _backwards(torch.autograd._engine_run_backward))

@@ -106,53 +106,31 @@ def descend(
     value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, steps: int, shares: Tensor | None,
     rows: Tensor | None = None,
 ) -> None:  # fmt: skip
-    """The `steps`-th step of Kingma and Ba 2015 on (M, ...) values and moments, in place; `shares` (n,) of it or all.
-    The gradient is that of the rows (n,), of all where None.
+    """Take the `steps`-th step of Kingma and Ba 2015 on (M, ...) values and moments, in place; `shares` (n,) of it or
+    all. The gradient is that of the rows (n,), of all where None. Contiguous float32 values, on a CPU by a compiled
+    loop, on a card by a kernel.
 
     Numbers with a gradient of 0 wait, and so do their moments: most Gaussians are seen by few of the views, and would
     drift on in between by what the last of them wanted.
-
-    float32 on a CPU takes a compiled loop, one pass over memory, and on a card a kernel; everything else plain torch.
     """
-    if gpu.supports_triton(value) and value.is_contiguous():
-        descend_by_kernel(value, gradient, first, second, rate, steps, shares, rows)
-    elif value.device.type == "cpu" and value.dtype == torch.float32 and value.ndim in (1, 2) and value.is_contiguous():
-        _descend_fast(value, gradient, first, second, rate, steps, shares, rows)
-    elif rows is None:
-        plain_descend(value, gradient, first, second, rate, steps, shares)
-    else:
-        parts = [x[rows] for x in (value, first, second)]
-        plain_descend(parts[0], gradient, parts[1], parts[2], rate, steps, shares)
-        for whole, part in zip((value, first, second), parts, strict=True):
-            whole[rows] = part
-
-
-def plain_descend(
-    value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, steps: int, shares: Tensor | None
-) -> None:
-    """The same by torch's own functions, for all rows."""
-    waits = gradient == 0
-    first.copy_(torch.where(waits, first, first.lerp(gradient, 1 - _BETA1)))
-    second.copy_(torch.where(waits, second, (second * _BETA2).addcmul_(gradient, gradient, value=1 - _BETA2)))
-    change = first / (second.sqrt() / math.sqrt(1 - _BETA2**steps) + _EPSILON) * (-rate / (1 - _BETA1**steps))
-    change = change.masked_fill(waits, 0)
-    value.add_(change if shares is None else change * shares.reshape(-1, *[1] * (value.ndim - 1)))
-
-
-def descend_by_kernel(
-    value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, steps: int, shares: Tensor | None,
-    rows: Tensor | None = None,
-) -> None:  # fmt: skip
-    """The same by a kernel of Triton, on contiguous float32 values of one card."""
-    from .adam_kernels import descend_rows  # imports triton
-
-    count, width = gradient.numel(), math.prod(value.shape[1:])
-    if count == 0:
+    if gradient.numel() == 0:
         return
+    width = value[0].numel()
     if width > 1 and (gradient.ndim > 2 or gradient.stride(-1) != 1):
         gradient = gradient.contiguous()
     stride = width if gradient.ndim > 2 else gradient.stride(0)
     scale, root = -rate / (1 - _BETA1**steps), 1 / math.sqrt(1 - _BETA2**steps)
+    by_kernel = _descend_on_card if gpu.supports_triton(value) else _descend_on_cpu
+    by_kernel(value, gradient, first, second, shares, rows, width, stride, scale, root)
+
+
+def _descend_on_card(
+    value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, shares: Tensor | None, rows: Tensor | None,
+    width: int, stride: int, scale: float, root: float,
+) -> None:  # fmt: skip
+    from .adam_kernels import descend_rows  # imports triton
+
+    count = gradient.numel()
     # A kernel takes no None: what is not there is not read.
     given = (gradient, gradient if rows is None else rows, gradient if shares is None else shares.contiguous())
     gpu.launch(
@@ -162,27 +140,21 @@ def descend_by_kernel(
     )  # fmt: skip
 
 
-def _descend_fast(
-    value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, steps: int, shares: Tensor | None,
-    rows: Tensor | None,
+def _descend_on_cpu(
+    value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, shares: Tensor | None, rows: Tensor | None,
+    width: int, stride: int, scale: float, root: float,
 ) -> None:  # fmt: skip
-    count, width = len(gradient), value[0].numel() if len(value) else 0
-    if count * width == 0:
-        return
-    if width > 1 and gradient.stride(-1) != 1:
-        gradient = gradient.contiguous()
-    stride = gradient.stride(0)
+    count = len(gradient)
     # A gradient may be some columns of a larger one: taken as one long array from its first number to its last.
     lies = torch.as_strided(gradient, (stride * (count - 1) + width,), (1,)).numpy()
     arrays = [x.numpy().reshape(-1) for x in (value, first, second)]
     chosen = np.empty(0, np.int64) if rows is None else rows.numpy()
     own = np.empty(0, np.float32) if shares is None else shares.numpy()
-    scale, root = np.float32(-rate / (1 - _BETA1**steps)), np.float32(1 / math.sqrt(1 - _BETA2**steps))
+    factors = np.float32(scale), np.float32(root)
 
     def work(block: int) -> None:
-        _descend_rows(
-            *arrays, lies, chosen, own, block * _ROWS, min(count, (block + 1) * _ROWS), width, stride, scale, root,
-        )  # fmt: skip
+        span = block * _ROWS, min(count, (block + 1) * _ROWS)
+        _descend_rows(*arrays, lies, chosen, own, *span, width, stride, *factors)
 
     for_each(work, -(-count // _ROWS))
 

@@ -243,7 +243,7 @@ def maximum(typing_context: Any, value: Any, other: Any) -> Any:
 
 
 @intrinsic
-def any_of(typing_context: Any, condition: Any) -> Any:
+def any_lane(typing_context: Any, condition: Any) -> Any:
     """Whether the condition holds in any lane."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:

@@ -23,7 +23,7 @@ from ..providers import class_colors
 from ..render.api import render
 from ..render.gaussian_map import GaussianMap, decided_channels
 from ..render.inspection import median_depth
-from ..render.reference import ALPHA_MAX, ALPHA_MIN, CUT_SIGMAS, TRANSMITTANCE_MIN
+from ..render.rules import ALPHA_MAX, ALPHA_MIN, CUT_SIGMAS, TRANSMITTANCE_MIN
 from ..system.jit import kernel
 from ..types import VOID, Array, ClassTable, Intrinsics
 

@@ -23,7 +23,7 @@ from ..compute.threads import get_threads, host_threads
 from ..config import ExportConfig
 from ..geometry.camera import project, resample_nearest
 from ..geometry.posed_depth import PosedDepth
-from ..mapping.measure import DrawnView, Shown, drawn_view
+from ..mapping.measure import DepthViews, MeshView, mesh_view
 from ..outcome import Outcome, load_outcome, maps_around
 from ..run.stages import StageContext
 from ..run.tasks import Chunk, in_chunks
@@ -65,7 +65,7 @@ def write_meshes(context: StageContext, folder: Path, outcome: Outcome, world: W
     in_chunks(context, draw_keyframes, count, move=outcome.move)
     if settings.planes:
         in_chunks(context, snap_views, count, planes=planes_in(scratch, count))
-    views = drawn_views(scratch, count)
+    views = mesh_views(scratch, count)
     if not ply.exists():
         grid = _grid_around(views, settings)
         regions, class_ids = len(list(grid.regions())), tuple(outcome.label_of_channel.tolist())
@@ -78,7 +78,7 @@ def write_meshes(context: StageContext, folder: Path, outcome: Outcome, world: W
     if mesh.face_count > MAX_TEXTURED or not settings.texture:
         write_mesh_glb(glb, mesh, names, axes)
     else:
-        textured = make_textured(outcome, read_mesh_ply(ply), Shown(views), context.progress)
+        textured = make_textured(outcome, read_mesh_ply(ply), DepthViews(views), context.progress)
         turned = replace(textured, vertices=(textured.vertices @ axes.T).astype(np.float32))
         write_textured_glb(glb, turned, names)
     return [ply, glb]
@@ -109,7 +109,7 @@ def draw(outcome: Outcome, settings: ExportConfig, scratch: Path, progress: Prog
         if not (file := _view_file(scratch, number)).exists():
             row = rows[number]
             frame_id = int(t.frame_ids[row])
-            view = drawn_view(near(frame_id), t.cam_from_world[row], camera)
+            view = mesh_view(near(frame_id), t.cam_from_world[row], camera)
             if settings.planes and (maps := outcome.run.find_proxy(frame_id)) is not None:
                 view = replace(view, unsure=resample_nearest(maps.confidence, camera.height, camera.width) < SURE)
             save_value(file, view)
@@ -128,7 +128,7 @@ def snap(scratch: Path, planes: Planes, progress: Progress, numbers: range) -> N
     """Move uncertain depths of the views of `draw` onto the planes; a view that is done stays."""
 
     def snap_one(number: int) -> None:
-        view: DrawnView = load_value(file := _view_file(scratch, number))
+        view: MeshView = load_value(file := _view_file(scratch, number))
         if view.unsure is not None:
             save_value(file, snap_to_planes(view, planes))
 
@@ -140,12 +140,12 @@ def snap(scratch: Path, planes: Planes, progress: Progress, numbers: range) -> N
 def planes_in(scratch: Path, count: int) -> Planes:
     """The planes of what `draw` has left, found once: views that are straight would give others."""
     if not (file := scratch / "planes.npz").exists():
-        save_value(file, planes_of(drawn_views(scratch, count)))
+        save_value(file, planes_of(mesh_views(scratch, count)))
     planes: Planes = load_value(file)
     return planes
 
 
-def drawn_views(scratch: Path, count: int) -> Sequence[DrawnView]:
+def mesh_views(scratch: Path, count: int) -> Sequence[MeshView]:
     """Load the renderings of `draw` on demand; the last ones used stay in memory."""
     return LruSequence(count, lambda n: load_value(_view_file(scratch, n)), lambda view: view.size, _KEPT_BYTES)
 
@@ -154,9 +154,9 @@ def _view_file(scratch: Path, number: int) -> Path:
     return scratch / f"view_{number:06d}.npz"
 
 
-def _grid_around(views: Sequence[DrawnView], settings: ExportConfig) -> Grid:
+def _grid_around(views: Sequence[MeshView], settings: ExportConfig) -> Grid:
     """The voxel grid around what the views show, by their median depth."""
-    shown = Shown(views)
+    shown = DepthViews(views)
     step = 16 * -(-len(shown) // LONG)
     seen = np.concatenate([v.depth[v.trust > 0][::step] for v in shown])
     median = float(np.median(seen)) if len(seen) else 1.0
@@ -166,7 +166,7 @@ def _grid_around(views: Sequence[DrawnView], settings: ExportConfig) -> Grid:
 def fuse_views(task: Chunk, progress: Progress) -> None:
     """The surface of the map as the keyframes see it, in some regions of the grid; what is there stays."""
     scratch, known = _scratch(task.context(progress)), task.known
-    grid, views = known["grid"], drawn_views(scratch, known["views"])
+    grid, views = known["grid"], mesh_views(scratch, known["views"])
     parts = list(grid.regions())
     for number in task.numbers:
         if not (file := _region_file(scratch, number)).exists():
@@ -179,7 +179,7 @@ def _region_file(scratch: Path, number: int) -> Path:
 
 
 def _region(
-    views: Sequence[DrawnView],
+    views: Sequence[MeshView],
     grid: Grid,
     class_ids: tuple[int, ...],
     chunks: NDArray[np.int32],
@@ -203,7 +203,7 @@ def mesh_figures(mesh: MeshBlocks) -> dict[str, int | float]:
 
 
 def paint(
-    vertices: NDArray[np.float32], views: Iterable[DrawnView], class_ids: tuple[int, ...], tolerance: float
+    vertices: NDArray[np.float32], views: Iterable[MeshView], class_ids: tuple[int, ...], tolerance: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """colors (V, 3) uint8 and labels (V,) uint8: weighted mean and vote of the views that see a vertex.
 

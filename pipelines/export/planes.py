@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..geometry.camera import resample_nearest, unproject_depth
 from ..geometry.posed_depth import PosedDepth
 from ..geometry.voxels import VOXELS_PER_DEPTH, Voxels, find, gather_depths, neighbour_keys, normals_in_cam, voxel_keys
-from ..mapping.measure import DrawnView
+from ..mapping.measure import MeshView
 from ..outcome import spread_sample
 
 _SIDE = 200
@@ -113,7 +113,7 @@ def _on(voxels: Voxels, normal: Array, offset: float, within: float, along: floa
     return np.asarray(close & (voxels.normal @ normal > along))
 
 
-def planes_of(views: Sequence[DrawnView]) -> Planes:
+def planes_of(views: Sequence[MeshView]) -> Planes:
     """The planes of what the views surely show."""
     some = (views[n].shown for n in spread_sample(range(len(views)), _COMPARED))
     seen = [float(np.median(v.depth[v.trust > 0])) for v in some if (v.trust > 0).any()]
@@ -121,14 +121,14 @@ def planes_of(views: Sequence[DrawnView]) -> Planes:
     return find_planes(gather_depths((_sure_part(view) for view in views), size))
 
 
-def _sure_part(view: DrawnView) -> PosedDepth:
+def _sure_part(view: MeshView) -> PosedDepth:
     shown, small = view.shown, view.shown.intrinsics.at_most(_SIDE)
     trust = shown.trust if view.unsure is None else np.where(view.unsure, 0, shown.trust).astype(np.float32)
     depth, trust = (resample_nearest(x, small.height, small.width) for x in (shown.depth, trust))
     return PosedDepth(small, shown.cam_from_world, depth, trust)
 
 
-def snap_to_planes(view: DrawnView, planes: Planes) -> DrawnView:
+def snap_to_planes(view: MeshView, planes: Planes) -> MeshView:
     """Put its uncertain depths on the nearest plane that they lie along, along their rays; `unsure` is None then."""
     if view.unsure is None:
         return view

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from ...formats.colmap import ModelArrays, pose_of
 from ...formats.errors import InputError
 from ..geometry.sparse_model import SparseModel
-from ..run.extension import ParentRun
 from ..run.stages import StageContext
 from ..sfm.adjust import focals_of_halves
 from ..sfm.candidates import GIVEN, GIVEN_ONLY
@@ -250,11 +249,10 @@ def _other_poses(context: StageContext, agreed: GivenFit, found: NDArray[np.floa
     )
 
 
-def in_world_of(before: ParentRun, model: SparseModel, frames: Sequence[Frame]) -> SparseModel:
-    """The model moved, turned and scaled to where its keyframes were before; as it is where none tells that."""
-    poses = before.poses_of([frames[i] for i in model.frame_ids.tolist()])
-    known = np.isfinite(poses).all(axis=(1, 2))
-    agreed = fit_given_poses(model.cam_from_world[known], poses[known])
+def in_world_of(given: GivenPoses, model: SparseModel) -> SparseModel:
+    """Move, turn and scale the model to where the given poses have its keyframes; as it is where none tells that."""
+    rows = model.frame_ids[given.known[model.frame_ids]]
+    agreed = fit_given_poses(model.cam_from_world[given.known[model.frame_ids]], given.cam_from_world[rows])
     return model if agreed is None else model.moved(agreed.move)
 
 

@@ -114,13 +114,13 @@ def _unknown(motion: StructureFromMotion) -> pycolmap.Camera:
 def _without_prior(
     context: StageContext, motion: StructureFromMotion, origin: str, keyframes: Sequence[int]
 ) -> Structure | None:
-    """The structure of an unknown focal length; None where none was known, nothing is found, or the camera is that of
-    a finished run or cut from panoramas.
+    """The structure of an unknown focal length; None where none was known, nothing is found, or the camera is cut from
+    panoramas.
 
     Features are the same; pairs are matched again, for at a wrong focal length too few matches obey one geometry.
     """
     held = origin == "given" and not context.config.frames.intrinsics
-    if held or motion.is_extension or not motion.camera.has_prior_focal_length:
+    if held or not motion.camera.has_prior_focal_length:
         return None
     snapshots = motion.snapshots.inside("without_prior")
     free = replace(

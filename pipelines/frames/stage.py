@@ -17,7 +17,6 @@ from ...formats.textfile import read_json, write_json
 from ...formats.video import VideoFrame
 from ..geometry.camera import Rig, rig_of
 from ..masks.static import find_static
-from ..run.extension import parent_of
 from ..run.files import BACKBONE, CALIBRATION, FEATURES, GIVEN_POSES, MATCHED_PAIRS, SPARSE, VOCABULARY, save_frames
 from ..run.stages import StageContext
 from ..run.tasks import in_chunks
@@ -26,6 +25,7 @@ from ..sfm.flow import Picture
 from ..sfm.lens import Lens, distortion_of, make_lens
 from ..sfm.rolling import straight_copy
 from ..sfm.two_views import require_motion
+from ..source.extending import is_extension, with_earlier_poses
 from ..source.faces import Faces, find_faces, level_mosaic, looks_like_panoramas
 from ..source.given import given_poses
 from ..source.recording import FolderRecording, Recording, open_recording
@@ -57,6 +57,7 @@ _NOISE_IMAGES = 8
 
 def run(context: StageContext) -> dict[str, Any]:
     """See `StageContext`; raises InputError for a source that cannot be used."""
+    context = replace(context, config=with_earlier_poses(context.source, context.config))
     source = open_recording(context.source, context.config.run.format)
     faces = find_faces(source, context.config.frames)
     if faces is None and looks_like_panoramas(source, context.config.frames):
@@ -95,7 +96,7 @@ def run(context: StageContext) -> dict[str, Any]:
             focal_sd = math.hypot(focal_sd, noise * structure.model.cameras[1].mean_focal_length())
     calibration = _calibration(context, lens, origin, focal_sd, faces, still)
     calibration = replace(calibration, readout=structure.readout)
-    _write_backbone(context, structure, keyframes, lens, frames)
+    _write_backbone(context, structure, keyframes, lens, frames, given)
     _write_correspondences(context, structure, keyframes, lens)
     _write_frames(context, source, frames, lens)
     masked = masks.write(context.folder, frames, lens)
@@ -125,10 +126,7 @@ def _keyframes(context: StageContext, frames: list[Frame], masks: FrameMasks, ri
     panoramas all sides are keyframes."""
     table = context.snapshot / "keyframes.json"
     if not table.exists():
-        before = parent_of(context.source)
-        chosen, first = ([], 0) if before is None else before.keyframes_of(frames)
-        added = _choose(context, frames[first:], masks, rig).keyframes
-        chosen += [first + k for k in added]
+        chosen = list(_choose(context, frames, masks, rig).keyframes)
         if context.config.frames.poses and len(chosen) < _FEW_KEYFRAMES:  # blank pictures whose poses are known
             even = np.linspace(0, len(frames) - 1, min(_FEW_KEYFRAMES, len(frames))).round().astype(int)
             chosen = sorted({*chosen, *even.tolist()})
@@ -153,7 +151,7 @@ def _choose(context: StageContext, frames: list[Frame], masks: FrameMasks, rig: 
     parallax = context.config.frames.parallax
     while True:
         choice = choose_keyframes(pictures(), parallax / across)
-        if not (context.config.frames.poses or parent_of(context.source)):
+        if not context.config.frames.poses:
             require_motion(choice.largest_displacement * across, choice.has_detail)
         if len(choice.keyframes) >= min(_FEW_KEYFRAMES, len(places)) or parallax < context.config.frames.parallax / 3:
             return choice
@@ -231,14 +229,16 @@ def _calibration(
 
 
 def _write_backbone(
-    context: StageContext, structure: Structure, keyframes: list[int], lens: Lens, frames: list[Frame]
-) -> None:
+    context: StageContext, structure: Structure, keyframes: list[int], lens: Lens, frames: list[Frame],
+    given: GivenPoses | None,
+) -> None:  # fmt: skip
     def load_rgb(frame_id: int) -> NDArray[np.uint8]:
         return read_rgb(picked(context, frames[frame_id].name))
 
     model = to_sparse_model(structure.model, keyframes, lens, load_rgb)
-    before = parent_of(context.source)
-    BACKBONE.save(context.folder, model if before is None else in_world_of(before, model, frames))
+    if given is not None and is_extension(context.source):
+        model = in_world_of(given, model)
+    BACKBONE.save(context.folder, model)
     for number, piece in enumerate(structure.pieces, 2):
         SPARSE.save(context.folder / f"piece_{number}", to_sparse_model(piece, keyframes, lens, load_rgb))
 

@@ -11,7 +11,6 @@ from ...formats.errors import InputError
 from ...formats.textfile import read_json, write_json
 from ..geometry.camera import Rig
 from ..masks.still import SAMPLED, find_still
-from ..run.extension import parent_of
 from ..run.stages import StageContext
 from ..sfm.two_views import HOW_TO_FILM
 from ..types import Frame
@@ -77,7 +76,7 @@ def leave_out_still(context: StageContext, masks: FrameMasks, frames: Sequence[F
     if not table.exists():
         write_json(table, asdict(_found(context, masks, frames, rig)))
     still = StillShare(**read_json(table, None))
-    if still.left_out > _MOST and not (context.config.frames.poses or parent_of(context.source)):
+    if still.left_out > _MOST and not context.config.frames.poses:
         raise InputError(
             f"{_percent(still.left_out)} of the image stands still while the rest moves. If the scene is what moves, "
             "as on a turntable or in a small part of a screen, leave out all else with --masks FOLDER. Otherwise the "

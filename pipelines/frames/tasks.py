@@ -10,12 +10,11 @@ import pycolmap
 from ...formats.datasets.sequence import Camera
 from ...formats.images import read_rgb
 from ..geometry.camera import Rig, rig_of
-from ..run.extension import parent_of
 from ..run.stages import StageContext
 from ..run.tasks import Chunk
 from ..sfm.driver import Divide, StructureFromMotion, no_prefetch
 from ..sfm.features import clear_of
-from ..sfm.lens import FOCAL_GUESS, calibrated_camera, to_pycolmap, unknown_camera
+from ..sfm.lens import FOCAL_GUESS, to_pycolmap, unknown_camera
 from ..sfm.matching import match_features
 from ..sfm.rolling import frame_interval
 from ..sfm.snapshots import Snapshots, features_name
@@ -38,9 +37,6 @@ def known_camera(context: StageContext, source: Recording, faces: Faces | None) 
         pinhole = Camera(**asdict(faces.pinhole))
         return to_pycolmap(pinhole), "given"
     width, height = reduced_size(source.width, source.height, config.max_side)
-    before = parent_of(context.source)
-    if before is not None and before.camera.origin != "given":
-        return calibrated_camera(before.camera), before.camera.origin
     if config.intrinsics:
         given = read_intrinsics(config.intrinsics, source.width, source.height)
         return to_pycolmap(given.resized(width, height)), "given"
@@ -68,7 +64,7 @@ def structure_from_motion(
 ) -> StructureFromMotion:
     """Prepare structure from motion of these frames; `origin` is as in `known_camera`, `has_times` as of a source."""
     settings, size = context.config.frames, (camera.width, camera.height)
-    learned, before = open_learned(settings), parent_of(context.source)
+    learned = open_learned(settings)
     start = given.cam_from_world if given is not None else None
 
     snapshots = whole = Snapshots(context.snapshot)
@@ -91,8 +87,7 @@ def structure_from_motion(
         camera=camera,
         is_fixed=origin in ("given", "stated"),
         is_stated=origin == "stated",
-        given=start if before is None else before.poses_of(frames),
-        is_extension=before is not None,
+        given=start,
         frame_interval=_interval(frames) if has_times else 0.0,
         extract=extract,
         picture=lambda frame_id: grey_of(context, masks, frames[frame_id]),

@@ -39,7 +39,7 @@ from ..types import Array, Features, Trajectory, any_of
 
 Image = NDArray[np.uint8]
 _SNAPSHOT_EVERY = 200
-_BESIDE = 2
+_NEIGHBOURS = 2
 """Keyframes, and picked frames, on each side by which an image is placed."""
 _STATIONS = 1 << 26
 """More than a source has images: image i in direction c has the number c * _STATIONS + i."""
@@ -200,13 +200,13 @@ class Placer:
     def place(self, index: int, time: float, images: list[Image]) -> Placed | None:
         """Place image `index`, seen in each direction; None where it is beside no frame of this run."""
         at = int(np.searchsorted(self._in_order, index))
-        beside = [i for i in self._in_order[max(at - 1, 0) : at + 1].tolist() if i in self._times]
-        if not beside:
+        around = [i for i in self._in_order[max(at - 1, 0) : at + 1].tolist() if i in self._times]
+        if not around:
             return None
-        if all(i in self.lost for i in beside):
-            return Placed(index, time, np.eye(4), self.lost[beside[0]])
+        if all(i in self.lost for i in around):
+            return Placed(index, time, np.eye(4), self.lost[around[0]])
         self.pictures.at_hand = {c * _STATIONS + index: image for c, image in enumerate(images)}
-        self.pictures.around = {n: [n - index + i for i in beside] for n in self.pictures.at_hand}
+        self.pictures.around = {n: [n - index + i for i in around] for n in self.pictures.at_hand}
         found = [(number, *self._find(number, time)) for number in self.pictures.at_hand]
         number, seen, solved = max(found, key=lambda f: 0 if f[2] is None else int(f[2].inliers.sum()))
         if solved is None or not self.front_end.is_trusted(seen, solved):
@@ -217,9 +217,9 @@ class Placer:
 
     def _find(self, number: int, time: float) -> tuple[Sightings, FramePose | None]:
         """Sightings, and the pose they agree on: by flow from the keyframes around, else by their features."""
-        beside = self._beside(number)
-        start = predict_pose(number, beside, {**{i: self._times[i] for i in beside}, number: time})
-        near = self.state.nearest_keyframes(number, _BESIDE)
+        around = self._poses_around(number)
+        start = predict_pose(number, around, {**{i: self._times[i] for i in around}, number: time})
+        near = self.state.nearest_keyframes(number, _NEIGHBOURS)
         near = [k for k in near if k // _STATIONS == number // _STATIONS]
         seen, solved = NO_SIGHTINGS, None
         if start is not None and near:
@@ -233,10 +233,10 @@ class Placer:
         """The pose adjusted to what is seen, but for the errors of the keyframes' pixels and a rolling shutter."""
         velocity: dict[int, Array] = {}
         if self.state.shutter.is_rolling:
-            beside = self._beside(number) | {number: pose}
-            ids = sorted(beside)
+            around = self._poses_around(number) | {number: pose}
+            ids = sorted(around)
             times = np.array([self._times.get(i, time) for i in ids])
-            own = velocities(np.array([beside[i] for i in ids]), times)[ids.index(number)]
+            own = velocities(np.array([around[i] for i in ids]), times)[ids.index(number)]
             velocity = self._velocities | {number: own}
         self.state.add_frame(number, pose, seen, False, 0)
         settle(number, self.state, self.calibration.intrinsics, velocity)
@@ -250,10 +250,10 @@ class Placer:
         of_posed = velocities(np.array([self._poses[i] for i in self._posed.tolist()]), times)
         return dict(zip(self._posed.tolist(), of_posed, strict=True))
 
-    def _beside(self, number: int) -> dict[int, Array]:
+    def _poses_around(self, number: int) -> dict[int, Array]:
         """Poses of the picked frames around, in the same direction."""
         at = int(np.searchsorted(self._posed, number))
-        near = self._posed[max(at - _BESIDE, 0) : at + _BESIDE].tolist()
+        near = self._posed[max(at - _NEIGHBOURS, 0) : at + _NEIGHBOURS].tolist()
         return {i: self._poses[i] for i in near if i // _STATIONS == number // _STATIONS}
 
     def _follow(self, numbers: NDArray[np.int64], poses: Array, old: Array, new: Array) -> Array:

@@ -30,7 +30,7 @@ class Closed:
     error_after: float
 
 
-def close_loops(
+def adjust_with_loops(
     state: TrackState,
     loops: Sequence[Loop],
     drifted: bool,

@@ -1,20 +1,30 @@
-"""Finding loops: candidates, geometric verification, and the two tests that a false loop of repeated texture fails."""
+"""Finding loops: candidates by appearance, geometric verification, and two tests that a false loop of repeated texture
+fails."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 
 from ..geometry import se3
 from ..geometry.camera import unproject
+from ..geometry.sparse_model import SparseModel
+from ..sfm.features import GlobalDescriptors, far_apart, loop_pairs
 from ..sfm.matching import match_descriptors
 from ..tracking.pnp import FramePose, solve_pose
 from ..tracking.state import Sightings
 from ..types import Array, Features, Intrinsics, LoopEdge
 
+GAP = 8
+"""A loop joins keyframes at least this many apart."""
+SHARED_POINTS = 15
+"""Keyframes with this many points in common need no loop."""
+PER_KEYFRAME, MIN_ALIKE = 2, 0.02
+"""Loops proposed by each keyframe's appearance, and the least appearance similarity of one."""
 ERROR = 4.0
 """Pixels within which a feature agrees with a loop."""
 INLIERS, SHARE = 25, 0.3
@@ -29,6 +39,28 @@ SURE_INLIERS = 80
 """With so many a loop needs no support by its neighbours."""
 DRIFT, ANGLE_DRIFT, SCALE_DRIFT = 0.05, 10.0, 1.5
 """A loop is false that claims more drift than this share of the path, more degrees, or a larger factor of scale."""
+
+
+def shared_points(model: SparseModel) -> csr_matrix:
+    """(N, N): how many points two keyframes both see."""
+    seen = model.seen.astype(np.int32)
+    return (seen @ seen.T).tocsr()
+
+
+def loop_candidates(
+    model: SparseModel, descriptors: GlobalDescriptors, refused: Collection[tuple[int, int]]
+) -> list[tuple[int, int]]:
+    """Return pairs (i, j), i < j, of keyframe indices, sorted: the most alike of each keyframe that are far apart in
+    the sequence and have hardly a point in common; none of the pairs of frame ids that structure from motion has
+    refused."""
+    ids = model.frame_ids.tolist()
+    shared, apart = shared_points(model), far_apart(len(ids), GAP)
+
+    def unrelated(part: slice) -> NDArray[np.bool_]:
+        return apart(part) & (shared[part].toarray() < SHARED_POINTS)
+
+    alike = loop_pairs(descriptors, unrelated, PER_KEYFRAME, MIN_ALIKE)
+    return [(i, j) for i, j in alike if (ids[i], ids[j]) not in refused]
 
 
 @dataclass(frozen=True)
@@ -154,7 +186,7 @@ class Loop:
     in_first: Sightings
 
 
-def make_view(
+def make_keyframe_view(
     frame_id: int,
     cam_from_world: Array,
     features: Features,

@@ -10,15 +10,13 @@ from ...formats.atomic import copy_file
 from ..depth.align import sample_proxy
 from ..geometry import se3
 from ..geometry.sparse_model import SparseModel
-from ..mapping.build import Refined, refine_map
-from ..mapping.load import with_rigid_panoramas
 from ..mapping.move_map import follow_keyframes, move_map, move_trajectory
+from ..mapping.stage import Refined, refine_map
+from ..mapping.views import with_rigid_panoramas
 from ..render.gaussian_map import GaussianMap
 from ..run.files import (
     CALIBRATION,
-    CLASSES,
     DEPTH_FIELDS,
-    DESCRIPTORS,
     EXPOSURE,
     FIGURES,
     LOOPS,
@@ -27,21 +25,19 @@ from ..run.files import (
     SPARSE,
     TRAJECTORY,
 )
-from ..run.folder import RunFolder
 from ..run.stages import StageContext
 from ..sfm.adjust import FEATURE_SD
 from ..sfm.bundle import reprojection_errors
-from ..sfm.features import GlobalDescriptors, compute_global_descriptors, unit
+from ..sfm.features import GlobalDescriptors, compute_global_descriptors
 from ..system.parallel import LruSequence
 from ..system.values import load_value, save_value
 from ..tracking.adjust import align_depths, without_dependent_depth
 from ..tracking.pictures import Pictures, load_shutter
 from ..tracking.state import TrackState, sparse_model_of
-from ..types import VOID, Array, Intrinsics, Trajectory
+from ..types import Array, Intrinsics, Trajectory
 from .between import pose_every_frame
-from .candidates import LabelSummary, loop_candidates, summarise_labels
-from .close import Closed, close_loops
-from .loops import FoundLoops, KeyframeView, Loop, find_loops, make_view
+from .close import Closed, adjust_with_loops
+from .loops import FoundLoops, KeyframeView, Loop, find_loops, loop_candidates, make_keyframe_view
 
 DRIFT_PX = 6.0
 """A loop that is off by more pixels starts a pose graph."""
@@ -64,7 +60,7 @@ def run(context: StageContext) -> dict[str, Any]:
     # Loops of panoramas are those that structure from motion closes: the pose graph knows no places.
     is_rig = context.run.load(CALIBRATION).directions > 1
     found = search(context, model) if settings.use_loops and not is_rig else FoundLoops([], 0, 0, 0)
-    closed = adjust(context, model, found)
+    closed = apply_loops(context, model, found)
     gaussian_map: GaussianMap | None = None  # as mapping left it
     moved_px = 0.0
     if closed is not None:
@@ -90,7 +86,7 @@ def run(context: StageContext) -> dict[str, Any]:
 
 
 def search(context: StageContext, model: SparseModel) -> FoundLoops:
-    """Candidates by appearance and semantics, verified; kept in a snapshot."""
+    """Find candidates by appearance and verify them; kept in a snapshot."""
     snapshot = context.snapshot / "loops.npz"
     if snapshot.exists():
         return load_value(snapshot)
@@ -99,13 +95,9 @@ def search(context: StageContext, model: SparseModel) -> FoundLoops:
     views = keyframe_views(context, model, pictures)
     ids = model.frame_ids.tolist()
     all_features = map(pictures.features, context.progress.track(ids, "features", len(ids)))
-    kinds = [compute_global_descriptors(all_features, len(ids), pictures.vocabulary)]
-    learned = run.find(DESCRIPTORS) or {}
-    if all(i in learned for i in ids):  # the paper's DINOSim counts half
-        seen = np.stack([learned[i] for i in ids])
-        kinds.append(unit(seen - seen.mean(0)).astype(np.float32))
+    descriptors = GlobalDescriptors((compute_global_descriptors(all_features, len(ids), pictures.vocabulary),))
     refused = {pair for pair, matches in run.load(MATCHED_PAIRS).items() if matches == 0}
-    pairs = loop_candidates(model, GlobalDescriptors(tuple(kinds)), load_summaries(run, model), refused)
+    pairs = loop_candidates(model, descriptors, refused)
     tracked = context.progress.track(pairs, "loops", len(pairs))
     found = find_loops(tracked, views, model.cam_from_world, run.load(CALIBRATION).intrinsics, seed)
     save_value(snapshot, found)
@@ -126,21 +118,12 @@ def keyframe_views(context: StageContext, model: SparseModel, pictures: Pictures
         if (maps := run.find_proxy(frame_id)) is not None:
             depth, _ = sample_proxy(fields.in_world(frame_id, maps), features.xy, intrinsics)
         pose, seen = model.cam_from_world[k], state.sightings[frame_id]
-        return make_view(frame_id, pose, features, seen, model.points_in_world, depth, intrinsics)
+        return make_keyframe_view(frame_id, pose, features, seen, model.points_in_world, depth, intrinsics)
 
     return LruSequence(len(model.frame_ids), load, lambda view: view.features.nbytes, _VIEWS_ROOM)
 
 
-def load_summaries(run: RunFolder, model: SparseModel) -> list[LabelSummary]:
-    """Summarise the labels of every keyframe; those of one without labels say nothing."""
-    classes = len(run.load(CLASSES))
-    unknown = np.full((2, 2), VOID, np.uint8)
-    ids = model.frame_ids.tolist()
-    all_maps = map(run.find_proxy, ids)
-    return [summarise_labels(unknown if maps is None else maps.labels, classes) for maps in all_maps]
-
-
-def adjust(context: StageContext, model: SparseModel, found: FoundLoops) -> Closed | None:
+def apply_loops(context: StageContext, model: SparseModel, found: FoundLoops) -> Closed | None:
     """Everything adjusted with the loops; None without loops, or when they contradict what was known before."""
     if not found.loops:
         return None
@@ -153,7 +136,7 @@ def adjust(context: StageContext, model: SparseModel, found: FoundLoops) -> Clos
     metric = bool(report.get("metric", False))
     tracking = without_dependent_depth(config.tracking, report)
     drifted = drift > DRIFT_PX
-    closed = close_loops(state, found.loops, drifted, intrinsics, run.find_proxy, metric, tracking)
+    closed = adjust_with_loops(state, found.loops, drifted, intrinsics, run.find_proxy, metric, tracking)
     if closed.error_after > 1.5 * closed.error_before + 0.05:
         context.warn(
             f"{len(found.loops)} loops were refused: with them the reprojection error of what was known before rises "

@@ -170,16 +170,16 @@ def fit_color(
     one order."""
     color = tl.program_id(0)
     across = (width + STRIDE - 1) // STRIDE
-    told = across * ((height + STRIDE - 1) // STRIDE)
+    spread = across * ((height + STRIDE - 1) // STRIDE)
     old_gain, old_offset = tl.load(exposure + color), tl.load(exposure + 3 + color)
     gain, offset = tl.exp(old_gain.to(tl.float64)), old_offset.to(tl.float64)
     # In double precision, as variances from sums of squares want.
     nothing = tl.zeros((BLOCK,), tl.float64)
     used, total, sum_x, sum_y, sum_xx, sum_xy = nothing, nothing, nothing, nothing, nothing, nothing
     first = 0
-    while first < told:
+    while first < spread:
         place = first + tl.arange(0, BLOCK)
-        inside = place < told
+        inside = place < spread
         pixel = (place // across) * STRIDE * width + (place % across) * STRIDE
         solid = tl.load(silhouette + pixel, mask=inside, other=0.0) > SOLID
         solid = solid & scene_at(scene, pixel, inside, MASKED)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..compute.ssim import ssim_map
 from ..geometry.posed_depth import PosedDepth
 from ..render.gaussian_map import GaussianMap
-from ..render.inspection import look
+from ..render.inspection import render_all
 from ..types import VOID, Intrinsics
 from .views import View
 
@@ -37,7 +37,7 @@ def measure_view(
     """Compare the map, seen from `cam_from_world` (4, 4) with the given exposure (3,), with what the view shows of the
     scene. NaN for a view that is all masked: what is not compared agrees with nothing."""
     pose = torch.tensor(cam_from_world, dtype=torch.float64)  # a copy: workers get arrays to read only
-    seen = look(gaussian_map, pose, view.intrinsics)
+    seen = render_all(gaussian_map, pose, view.intrinsics)
     colors = seen.colors * torch.exp(torch.tensor(log_gain)).to(view.image.device)
     colors = (colors + torch.tensor(offset).to(view.image.device)).clamp(0, 1)
     photo = view.of_scene(view.colors, colors)
@@ -65,7 +65,7 @@ def mean_figures(figures: Sequence[ViewFigures], prefix: str) -> dict[str, float
 
 
 @dataclass(frozen=True)
-class DrawnView:
+class MeshView:
     """Depth and trust, colors (H, W, 3) uint8 and class channels (H, W) int16, -1 = none; None for a map without.
 
     unsure (H, W): where a depth may move onto a plane beside it, None for nowhere."""
@@ -87,10 +87,10 @@ class DrawnView:
         return sum(a.nbytes for a in self.arrays)
 
 
-class Shown(Sequence[PosedDepth]):
+class DepthViews(Sequence[PosedDepth]):
     """The depths alone of views that are loaded as they are asked for."""
 
-    def __init__(self, views: Sequence[DrawnView]) -> None:
+    def __init__(self, views: Sequence[MeshView]) -> None:
         self._views = views
 
     def __len__(self) -> int:
@@ -101,9 +101,9 @@ class Shown(Sequence[PosedDepth]):
 
 
 @torch.no_grad()
-def drawn_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> DrawnView:
+def mesh_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> MeshView:
     """Median depth with a weight: none where the map is thin or the depth jumps, less far away."""
-    seen = look(gaussian_map, torch.as_tensor(cam_from_world), camera)
+    seen = render_all(gaussian_map, torch.as_tensor(cam_from_world), camera)
     depth, silhouette = seen.median.cpu().numpy(), seen.silhouette.cpu().numpy()
     solid = (silhouette > 0.7) & (depth > 0) & ~_jumps(depth)
     typical = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
@@ -111,15 +111,15 @@ def drawn_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], c
     weight = np.where(solid, np.clip(typical / np.maximum(depth, 1e-9), 0.2, 1.5) ** 2 * silhouette, 0)
     channels = seen.channels.cpu().numpy() if gaussian_map.class_logits.shape[1] else None
     colors = (seen.colors.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-    return DrawnView(
+    return MeshView(
         PosedDepth(camera, cam_from_world, depth.astype(np.float32), weight.astype(np.float32)), colors, channels
     )
 
 
 def depth_view(gaussian_map: GaussianMap, cam_from_world: NDArray[np.float64], camera: Intrinsics) -> PosedDepth:
-    """The depth of a `drawn_view` alone."""
+    """The depth of a `mesh_view` alone."""
     without_classes = replace(gaussian_map, class_logits=gaussian_map.class_logits[:, :0])
-    return drawn_view(without_classes, cam_from_world, camera).shown
+    return mesh_view(without_classes, cam_from_world, camera).shown
 
 
 def _jumps(depth: NDArray[np.float32], tolerance: float = 0.08) -> NDArray[np.bool_]:

@@ -13,8 +13,7 @@ from ..compute.ssim import C1, C2, TAPS, WINDOW
 from ..config import MappingConfig
 from ..render.api import Rendering
 from . import losses
-from .exposure import MAX_GAIN, MIN_PIXELS, OUTLIER, RIDGE, SOLID, STRIDE
-from .losses import NU, SIZE_LIMIT, SSIM_WEIGHT, photo_loss
+from .losses import MAX_GAIN, MIN_PIXELS, NU, OUTLIER, RIDGE, SIZE_LIMIT, SOLID, SSIM_WEIGHT, STRIDE, photo_loss
 from .views import View
 
 _BLOCK = 512

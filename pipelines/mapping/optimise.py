@@ -13,16 +13,15 @@ from ..config import MappingConfig
 from ..render.api import Rendering, in_view, marked_in_view, project_map, render
 from ..render.gaussian_map import GaussianMap
 from ..render.inspection import class_weights
-from ..render.notes import Notes
+from ..render.rules import GaussianStats
 from ..system.parallel import LruSequence
 from ..system.progress import Progress, SilentProgress, is_asked
-from .exposure import SOLID, expose, fit_exposure
-from .growth import HIGH_RELIABILITY, LOW_RELIABILITY, Growth
+from .growth import HIGH_RELIABILITY, LOW_RELIABILITY, SEED_LOGIT, Growth
+from .losses import SOLID, expose, fit_exposure
 from .objective import Objective, color_errors_on_card, fit_exposure_on_card
 from .schedule import Schedule, Seeding, Step
-from .seeding import SEED_LOGIT
 from .state import KEYS, Exposures, OptimisedMap, OptimiserState
-from .views import View, halved
+from .views import View, half_view
 
 _FLOOR = 1 / (math.exp(SEED_LOGIT) - 1)
 """Added to every share of a class: one that has all votes gets the logit of a seed's own class, one without any 0."""
@@ -68,7 +67,7 @@ def optimise_map(
     every = max(settings.snapshot_every, len(views))
     remaining = range(state.iteration, schedule.total)
     for iteration in (progress or SilentProgress()).track(remaining, label, len(remaining)):
-        optimiser.visit(schedule.step(iteration))
+        optimiser.step(schedule.step(iteration))
         state.iteration = iteration + 1
         if state.iteration % len(views) == 0:
             state.parameters.require_finite_on_card()
@@ -92,19 +91,19 @@ class MapOptimiser:
         state: OptimiserState,
     ) -> None:
         self.views, self.settings, self.state = views, settings, state
-        self.halves = LruSequence(len(views), lambda i: halved(views[i]), lambda v: v.nbytes, HALVES_ROOM)
+        self.halves = LruSequence(len(views), lambda i: half_view(views[i]), lambda v: v.nbytes, HALVES_ROOM)
         self.unit = scene_depth(views)
         self.objective = Objective(settings, self.unit)
         self.growth = Growth(views, classes, settings, state, self.unit)
 
-    def visit(self, step: Step) -> None:
-        """Do what the schedule says: seed, compare, grow, prune."""
+    def step(self, step: Step) -> None:
+        """One optimisation step on one view: seed, compare, grow, prune."""
         view = (self.halves if step.coarse else self.views)[step.view]
         if step.seed is not Seeding.NOTHING:
             self._seed(step.view, step.seed)
         if len(self.state.parameters) == 0:
             return
-        rendering = self._step(step, view)
+        rendering = self._descend(step, view)
         if step.grow:
             self.growth.grow(step.view, Rendering(*(x.detach() for x in vars(rendering).values())))
         if step.split:
@@ -112,7 +111,7 @@ class MapOptimiser:
         if step.prune:
             self.growth.prune(by_weight=True)
 
-    def _step(self, step: Step, view: View) -> Rendering:
+    def _descend(self, step: Step, view: View) -> Rendering:
         """Compare and move the map, the view's pose and its exposure; returns what the view showed before."""
         parameters, on_card = self.state.parameters, gpu.supports_triton(self.state.parameters["means"])
         pose, radii = self.state.cam_from_world(step.view, view), torch.exp(parameters["log_radii"].detach())
@@ -125,17 +124,17 @@ class MapOptimiser:
             rows = in_view(*seeing)
             values = {k: parameters[k].detach().index_select(0, rows).requires_grad_() for k in KEYS}
         refines = self.settings.refine_poses and step.refine_pose
-        notes = Notes(view.scene) if step.note else None
-        rendering = self.draw(view, pose.requires_grad_(refines), values, notes)
+        stats = GaussianStats(view.scene) if step.note else None
+        rendering = self.draw(view, pose.requires_grad_(refines), values, stats)
         if self.settings.exposure:
             self._expose(step.view, view, rendering)
-        if notes is not None:
-            notes.errors = self._color_errors(step.view, view, rendering.features)
+        if stats is not None:
+            stats.errors = self._color_errors(step.view, view, rendering.features)
         exposure = self.state.exposures[step.view]
         loss = self.objective.of(view, exposure, rendering, values["log_radii"], seen) * step.weight
         of_map, of_view = gradients_of(loss, (values, {"pose": pose} if refines else {}))
-        if notes is not None:
-            self._note(notes, rows, view, pose, values)
+        if stats is not None:
+            self._note(stats, rows, view, pose, values)
         rates = {key: rate * step.rate for key, rate in MAP_RATES.items()}
         parameters.table.step(of_map, rates, self._shares(rows, values["log_radii"].detach()), rows)
         self.state.step_pose(step.view, view, of_view.get("pose"), POSE_RATE * step.rate, self.unit)
@@ -156,9 +155,11 @@ class MapOptimiser:
         self.growth.seed(index, what, self.draw(view, pose, values) if known else None)
 
     @torch.no_grad()
-    def _note(self, notes: Notes, rows: Tensor | None, view: View, pose: Tensor, values: Mapping[str, Tensor]) -> None:
+    def _note(
+        self, stats: GaussianStats, rows: Tensor | None, view: View, pose: Tensor, values: Mapping[str, Tensor]
+    ) -> None:
         radii = torch.exp(values["log_radii"])
-        self.growth.note(notes, rows, project_map(values["means"], radii, pose, view.intrinsics)[2])
+        self.growth.note(stats, rows, project_map(values["means"], radii, pose, view.intrinsics)[2])
 
     @torch.no_grad()
     def _color_errors(self, index: int, view: View, colors: Tensor) -> Tensor:
@@ -178,7 +179,7 @@ class MapOptimiser:
         exposure.copy_(fit_exposure(shown, view.colors, known, exposure))
 
     def draw(
-        self, view: View, cam_from_world: Tensor, values: Mapping[str, Tensor], notes: Notes | None = None
+        self, view: View, cam_from_world: Tensor, values: Mapping[str, Tensor], stats: GaussianStats | None = None
     ) -> Rendering:
         """Gaussians of raw parameters as the view sees them from (4, 4)."""
         return render(
@@ -188,7 +189,7 @@ class MapOptimiser:
             values["colors"],
             cam_from_world,
             view.intrinsics,
-            notes=notes,
+            stats=stats,
         )
 
     def _shares(self, rows: Tensor | None, log_radii: Tensor) -> dict[str, Tensor]:

@@ -20,7 +20,7 @@ from .views import View
 
 KEYS = ("means", "log_radii", "opacity_logits", "colors")
 """What is optimised."""
-_BESIDE = ("class_logits", "anchor_frame_ids", "trust", "noted")
+_KEPT = ("class_logits", "anchor_frame_ids", "trust", "noted")
 
 VIEW_KEYS = ("twist",)
 
@@ -150,8 +150,8 @@ class MapParameters:
         """Fresh moments, full trust."""
         values = {k: getattr(gaussian_map, k) for k in KEYS}
         m = gaussian_map
-        beside = (m.class_logits, m.anchor_frame_ids, torch.ones_like(m.log_radii), m.log_radii.new_zeros(len(m), 2))
-        return MapParameters(AdamTable(values), *beside)
+        others = (m.class_logits, m.anchor_frame_ids, torch.ones_like(m.log_radii), m.log_radii.new_zeros(len(m), 2))
+        return MapParameters(AdamTable(values), *others)
 
     def to_map(self) -> GaussianMap:
         """Return a copy of the current map."""
@@ -188,14 +188,14 @@ class MapParameters:
 
     def to_tensors(self) -> dict[str, Tensor]:
         """A flat table for a snapshot."""
-        beside = {name: getattr(self, name) for name in _BESIDE}
-        return {**self.table.to_tensors("map"), **beside}
+        others = {name: getattr(self, name) for name in _KEPT}
+        return {**self.table.to_tensors("map"), **others}
 
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor]) -> MapParameters:
         """Restore the parameters from what `to_tensors` returned."""
         table = AdamTable.from_tensors(tensors, "map", KEYS)
-        return MapParameters(table, *(tensors[name] for name in _BESIDE))
+        return MapParameters(table, *(tensors[name] for name in _KEPT))
 
 
 def empty_map(classes: int, device: torch.device | str = "cpu") -> GaussianMap:

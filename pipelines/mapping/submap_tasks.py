@@ -22,18 +22,15 @@ from ..depth.fields import DepthFields
 from ..geometry.posed_depth import PosedDepth
 from ..render.gaussian_map import GaussianMap
 from ..render.inspection import blending_weights, median_depth
-from ..run.extension import ParentRun
 from ..run.folder import RunFolder
 from ..system.machine import memory_room, resolve_device
 from ..system.progress import Progress
 from ..types import Intrinsics, Trajectory
-from .exposure import SeenExposures, common_exposure
-from .load import MappingInput, load_views
 from .measure import ViewFigures, measure_view
 from .optimise import optimise_map
 from .state import KEYS, Exposures, OptimisedMap
-from .submaps import Submap, nearest_seeing
-from .views import View
+from .submaps import SeenExposures, Submap, common_exposure, nearest_seeing
+from .views import MappingInput, View, load_views
 
 MADE, JOINED, REFINED, AGREED = "made", "joined", "refined", "agreed"
 _LABELS = {MADE: "mapping", REFINED: "refining"}
@@ -51,8 +48,7 @@ _DEPTH_SIDE = 160
 class SubmapTask:
     """What it takes to work on submap `number`: `trajectory` holds its views (to measure it: its own keyframes, and
     what is held out), `exposure` theirs, `fields` brings their depths into the world, `files` is the folder of all
-    submaps' results; `passes` of the refinement where they are not a share of making's; `measured`: kind of result;
-    `before`: the run that this one extends, whose map is grown."""
+    submaps' results; `passes` of the refinement where they are not a share of making's; `measured`: kind of result."""
 
     run: RunFolder
     config: Config
@@ -66,7 +62,6 @@ class SubmapTask:
     exposure: Exposures | None = None
     passes: float | None = None
     measured: str = AGREED
-    before: ParentRun | None = None
 
     @property
     def device(self) -> str:
@@ -133,14 +128,14 @@ def make_submap(task: SubmapTask, progress: Progress) -> None:
         result = _result(task, made, given.views)
         ids = np.array([v.frame_id for v in given.views])
         save_arrays(task.exposures, {"frame_ids": ids, "log_gains": made.log_gains, "offsets": made.offsets})
-        task.save(MADE, replace(result, depths=_depths(result, task.camera)) if task.submap.beside else result)
+        task.save(MADE, replace(result, depths=_depths(result, task.camera)) if task.submap.neighbours else result)
 
 
 def join_submap(task: SubmapTask, progress: Progress) -> None:
     """The Gaussians that no submap beside it shows from nearer, each anchored at the view that sees it from nearest."""
     if task.file(JOINED).exists():
         return
-    all_results = [task.load(MADE, n) for n in (task.number, *task.submap.beside)]
+    all_results = [task.load(MADE, n) for n in (task.number, *task.submap.neighbours)]
     views, ids = _posed(all_results, task.camera), np.concatenate([r.frame_ids for r in all_results])
     own = _in_common_exposure(task, all_results[0])
     m = own.gaussian_map
@@ -165,11 +160,11 @@ def refine_submap(task: SubmapTask, progress: Progress) -> None:
     """Its views visited again with all that they show, its own and what lies beside it; none comes or goes."""
     if task.file(REFINED).exists():
         return
-    beside = (task.number, *task.submap.beside)
-    ids, poses, (gains, offsets) = merge_results([task.load(JOINED, n).without_map for n in beside])
+    around = (task.number, *task.submap.neighbours)
+    ids, poses, (gains, offsets) = merge_results([task.load(JOINED, n).without_map for n in around])
     rows = np.searchsorted(ids, task.trajectory.frame_ids)
     given = task.views(replace(task.trajectory, cam_from_world=poses[rows]))
-    shown, places, weights = _shown(given.views, [task.load(JOINED, n).gaussian_map for n in beside])
+    shown, places, weights = _shown(given.views, [task.load(JOINED, n).gaussian_map for n in around])
     refined = _optimise(task, given, progress, REFINED, shown, (gains[rows], offsets[rows]))
     task.save(REFINED, replace(_result(task, refined, given.views), rows=places, weights=weights))
 
@@ -196,16 +191,16 @@ def average_overlap(task: SubmapTask, progress: Progress) -> None:
         return
     agreed = task.load(JOINED, task.number).gaussian_map
     total = torch.zeros(len(agreed), device=agreed.means.device)
-    for number in (*task.submap.beside, task.number):  # itself last: its keyframes are kept
-        told = task.load(REFINED, number)
-        mine = np.isin(told.gaussian_map.anchor_frame_ids.cpu().numpy(), task.submap.own)
-        rows, weights = (torch.from_numpy(a[mine]).to(total.device) for a in (told.rows, told.weights))
+    for number in (*task.submap.neighbours, task.number):  # itself last: its keyframes are kept
+        refined = task.load(REFINED, number)
+        mine = np.isin(refined.gaussian_map.anchor_frame_ids.cpu().numpy(), task.submap.own)
+        rows, weights = (torch.from_numpy(a[mine]).to(total.device) for a in (refined.rows, refined.weights))
         total[rows] += weights
         for key in (*KEYS, "class_logits"):
-            values, said = getattr(agreed, key), getattr(told.gaussian_map, key)[torch.from_numpy(mine)]
+            values, said = getattr(agreed, key), getattr(refined.gaussian_map, key)[torch.from_numpy(mine)]
             share = (weights / total[rows]).reshape(-1, *[1] * (values.ndim - 1))
             values[rows] += share * (said - values[rows])
-    task.save(AGREED, replace(told, gaussian_map=agreed, rows=told.rows[:0], weights=told.weights[:0]))
+    task.save(AGREED, replace(refined, gaussian_map=agreed, rows=refined.rows[:0], weights=refined.weights[:0]))
 
 
 STEPS: dict[str, Callable[[SubmapTask, Progress], None]] = {
@@ -224,7 +219,7 @@ def merge_results(results: Sequence[SubmapResult]) -> tuple[NDArray[np.int64], N
 
 def measure_submap(task: SubmapTask, progress: Progress) -> tuple[list[ViewFigures], list[ViewFigures]]:
     """Figures of its own keyframes and of the frames held out among those of its trajectory, where that puts them."""
-    maps = [task.load(task.measured, n).gaussian_map for n in (task.number, *task.submap.beside)]
+    maps = [task.load(task.measured, n).gaussian_map for n in (task.number, *task.submap.neighbours)]
     given = task.views(task.trajectory, task.config.mapping.hold_out)
     rows = {int(i): row for row, i in enumerate(task.trajectory.frame_ids)}
     whole = concatenate(maps)
@@ -249,8 +244,8 @@ def _optimise(
     """From a snapshot where there is one, which goes when the result is written."""
     settings, seed = replace(task.config.mapping, hold_out=0), task.config.run.seed
     visits = REFINING_SHARE * settings.passes if task.passes is None else task.passes
-    passes, rate = (None, 1.0) if initial is None else (visits, REFINING_RATE if task.submap.beside else 1.0)
-    of = f" submap {task.number + 1}" if task.submap.beside else ""
+    passes, rate = (None, 1.0) if initial is None else (visits, REFINING_RATE if task.submap.neighbours else 1.0)
+    of = f" submap {task.number + 1}" if task.submap.neighbours else ""
     return optimise_map(
         given.views, len(task.class_ids), settings, seed, initial, passes,
         progress=progress, snapshot=task.file(f"{kind}_state"), label=_LABELS[kind] + of,

@@ -2,6 +2,6 @@
 
 A room to hold beside the paper, reached by `reconstruct --method paper`. Every numbered equation has a function whose
 docstring begins with its number, or with those of several: (1) to (3) in `uncertainty`, (4) to (9) in `rendering`, (10)
-to (14) in `keyframes`, (15) and (16) in `tracking`, (17) to (20) in `mapping`, (21) to (24) in `loops`, (25) and (26)
-in `adjustment`. The paper's figure 1 is `slam`, and `stages` puts it into a run.
+to (16) in `tracking`, (17) to (20) in `mapping`, (21) to (26) in `adjustment`. The paper's figure 1 is `slam`, and
+`stages` puts it into a run.
 """

@@ -10,14 +10,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..compute.ssim import ssim_map
-from ..mapping.growth import useless
+from ..mapping.growth import seed_gaussians, useless
 from ..mapping.losses import size_loss
-from ..mapping.seeding import seed_gaussians
 from ..mapping.views import View
 from ..render.api import Rendering
 from ..types import VOID
 from .constants import PAPER, Constants
-from .gaussians import Gaussians, semantic_image, show
+from .rendering import Gaussians, semantic_image, show
 from .uncertainty import MirrorPlane, mirror_plane, symmetry_pull
 
 RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2, "class_logits": 5e-2}
@@ -80,14 +79,14 @@ def _fit_plane(
     columns: NDArray, rows: NDArray, values: NDArray[np.float32], use: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], float]:
     """Robust plane a x + b y + c through the used values, at all places, and the spread of its residuals."""
-    picked = np.flatnonzero(use)
-    picked = picked[:: max(len(picked) // _REGION_SAMPLES, 1)]
+    chosen = np.flatnonzero(use)
+    chosen = chosen[:: max(len(chosen) // _REGION_SAMPLES, 1)]
     design = np.stack([columns, rows, np.ones(len(rows))], 1) / [1000, 1000, 1]
-    target, weights = values[picked].astype(np.float64), np.ones(len(picked))
+    target, weights = values[chosen].astype(np.float64), np.ones(len(chosen))
     for _ in range(5):
-        a = design[picked] * weights[:, None]
+        a = design[chosen] * weights[:, None]
         plane = np.linalg.lstsq(a, target * weights, rcond=None)[0]
-        residual = np.abs(design[picked] @ plane - target)
+        residual = np.abs(design[chosen] @ plane - target)
         spread = 1.4826 * float(np.median(residual))
         weights = np.sqrt(1 / np.maximum(residual / max(spread, 1e-9), 1))
     return (design @ plane).astype(np.float32), spread
@@ -147,10 +146,10 @@ def semantic_loss(shown: Tensor, view: View, classes: int, constants: Constants 
 
 def needed(shown: Rendering, view: View, constants: Constants = PAPER) -> Tensor:
     """(H, W) the pixels where the map grows: by holes, by a nearer proxy, or by other classes."""
-    return holes(shown, constants) | nearer(shown, view, constants) | other_class(shown, view)
+    return uncovered(shown, constants) | nearer(shown, view, constants) | other_class(shown, view)
 
 
-def holes(shown: Rendering, constants: Constants = PAPER) -> Tensor:
+def uncovered(shown: Rendering, constants: Constants = PAPER) -> Tensor:
     """Condition (a) of growth: Sil < T_sil."""
     return shown.silhouette < constants.t_sil_new
 
@@ -213,13 +212,13 @@ def draw_together(gaussians: Gaussians, unit: float, seed: int) -> MirrorPlane:
     return plane
 
 
-def clip_beside_boundary(image: Tensor, channels: Tensor, limit: float) -> None:
+def clip_at_boundary(image: Tensor, channels: Tensor, limit: float) -> None:
     """Clip the gradient of an image (H, W, C) beside class boundaries, from now on, to `limit` times its mean norm.
 
     Section 3.4: there a wrong label of one pixel must not move the map."""
     if not image.requires_grad:
         return
-    near = beside_boundary(channels)
+    near = at_boundary(channels)
 
     def clip(gradient: Tensor) -> Tensor:
         norm = gradient.norm(dim=-1)
@@ -229,7 +228,7 @@ def clip_beside_boundary(image: Tensor, channels: Tensor, limit: float) -> None:
     image.register_hook(clip)
 
 
-def beside_boundary(channels: Tensor) -> Tensor:
+def at_boundary(channels: Tensor) -> Tensor:
     """(H, W) bool: another class within one pixel; void is no class."""
     classes = channels.float()[None, None]
     void = classes == VOID
@@ -246,7 +245,7 @@ def optimise(
     rows = gaussians.in_view(pose, view.intrinsics)
     values = gaussians.leaves(rows)
     shown = show(values, pose, view, kappa=constants.kappa / unit**2)
-    clip_beside_boundary(shown.features, view.channels, constants.clip)
+    clip_at_boundary(shown.features, view.channels, constants.clip)
     loss = map_loss(shown, view, values["log_radii"], classes, unit, constants)
     gradients = dict(zip(values, torch.autograd.grad(loss, list(values.values()), allow_unused=True), strict=True))
     step(gaussians, gradients, rows, rate, constants)

@@ -18,13 +18,12 @@ from ..mapping.move_map import follow_keyframes
 from ..mapping.views import View
 from ..render.api import Rendering
 from ..types import Intrinsics
-from .adjustment import beside, carry, local_adjustment
+from .adjustment import adjust_frame, carry, local_adjustment
 from .constants import PAPER, Constants
-from .gaussians import Gaussians, scaled_depth, show
-from .keyframes import overlap, select, semantic_keyframes, time_weights
 from .mapping import grow, optimise, prune
-from .tracking import predict, track
-from .uncertainty import agreement, semantic_agreement, with_agreement
+from .rendering import Gaussians, scaled_depth, show
+from .tracking import overlap, predict, select_keyframes, semantic_keyframes, time_weights, track_pose
+from .uncertainty import semantic_agreement, semantic_factor, with_agreement
 
 STEPS, FIRST_STEPS = 15, 60
 """Of mapping, after each keyframe and after the first."""
@@ -40,7 +39,7 @@ _COVERED = 0.1
 @dataclass
 class Slam:
     """All that is known after a frame; tables by frame id. fields: log scales (rows, columns) that bring a keyframe's
-    proxy depth into the map; looks: its labels (30, 40) and mean U."""
+    proxy depth into the map; summaries: its labels (30, 40) and mean U."""
 
     classes: int
     seed: int
@@ -48,7 +47,7 @@ class Slam:
     gaussians: Gaussians | None = None
     poses: dict[int, Tensor] = field(default_factory=dict)
     fields: dict[int, NDArray[np.float64]] = field(default_factory=dict)
-    looks: dict[int, tuple[NDArray[np.uint8], float]] = field(default_factory=dict)
+    summaries: dict[int, tuple[NDArray[np.uint8], float]] = field(default_factory=dict)
     lost: dict[int, str] = field(default_factory=dict)
 
     @property
@@ -63,19 +62,19 @@ class Slam:
                 self._begin(view, constants)
                 self._optimise(view_of, FIRST_STEPS, [view.frame_id], constants)
             return
-        found = track(self.gaussians, self._scaled(view), self._starts(), self.classes, self.unit, constants)
+        found = track_pose(self.gaussians, self._scaled(view), self._starts(), self.classes, self.unit, constants)
         if found.covered < _COVERED:
             self.lost[view.frame_id] = "the map covers too little of it"
             return
         pose = self.poses[view.frame_id] = _rotated(found.cam_from_world)
         if not (may_map and self._is_new(view, pose, constants)):
-            self.poses[view.frame_id] = self._beside(view, pose, view_of, constants)
+            self.poses[view.frame_id] = self._adjusted_frame(view, pose, view_of, constants)
             return
         with torch.no_grad():
             shown = show(vars(self.gaussians.map.only(self.gaussians.in_view(pose, view.intrinsics))), pose, view)
         view = self._agreeing(view, shown, constants)
         self.fields[view.frame_id] = fitted_field(view, shown.depth.numpy(), shown.silhouette.numpy() > constants.t_sil)
-        self.looks[view.frame_id] = _looks(view)
+        self.summaries[view.frame_id] = _summary(view)
         self._adjust(view_of, view.intrinsics, constants)
         pose = self.poses[view.frame_id]
         grow(self.gaussians, self._scaled(view), pose, self.classes, constants)
@@ -84,20 +83,20 @@ class Slam:
         if len(self.fields) % PRUNE_EVERY == 0:
             prune(self.gaussians, self.unit)
 
-    def _beside(self, view: View, pose: Tensor, view_of: Callable[[int], View], constants: Constants) -> Tensor:
+    def _adjusted_frame(self, view: View, pose: Tensor, view_of: Callable[[int], View], constants: Constants) -> Tensor:
         """(25) for a frame that is no keyframe and the last two that are, of which only the frame moves: a keyframe is
         adjusted in its window, and two others alone can lead it astray where they show little."""
         near = self.keyframes[-2:]
         poses = np.stack([*(self.poses[i].numpy() for i in near), pose.numpy()])
         fields = np.stack([self.fields[i] for i in [*near, near[-1]]])
-        new = beside(view_of, [*near, view.frame_id], poses, fields, self.classes, self.unit, constants)
+        new = adjust_frame(view_of, [*near, view.frame_id], poses, fields, self.classes, self.unit, constants)
         return _rotated(torch.from_numpy(new))
 
     def _begin(self, view: View, constants: Constants) -> None:
         """First pose = identity; the scale is that of the proxy depth."""
         self.unit = float(view.depth[view.depth > 0].median())
         self.poses[view.frame_id] = torch.eye(4, dtype=torch.float64)
-        self.fields[view.frame_id], self.looks[view.frame_id] = np.zeros((FINE.rows, FINE.columns)), _looks(view)
+        self.fields[view.frame_id], self.summaries[view.frame_id] = np.zeros((FINE.rows, FINE.columns)), _summary(view)
         self.gaussians = grow(None, view, self.poses[view.frame_id], self.classes, constants)
 
     def _starts(self) -> list[Tensor]:
@@ -127,7 +126,7 @@ class Slam:
             return view
         channels = shown.features[..., 3:].argmax(-1).to(torch.uint8)
         channels = torch.where(shown.silhouette > constants.t_sil, channels, view.channels)
-        theta = agreement(semantic_agreement(view.channels.numpy(), channels.numpy()), constants)
+        theta = semantic_factor(semantic_agreement(view.channels.numpy(), channels.numpy()), constants)
         weighed = with_agreement(view.reliability.numpy().astype(np.float64), theta, constants)
         return replace(view, reliability=torch.from_numpy(np.round(weighed).astype(np.uint8)))
 
@@ -136,11 +135,11 @@ class Slam:
         others = [k for k in self.keyframes if k != view.frame_id]
         points = self._points(view, pose)
         overlaps = [overlap(points, self.poses[k].numpy(), view.intrinsics) for k in others]
-        differs = semantic_keyframes(self.looks[view.frame_id][0], np.stack([self.looks[k][0] for k in others]))
+        differs = semantic_keyframes(self.summaries[view.frame_id][0], np.stack([self.summaries[k][0] for k in others]))
         ages = np.arange(len(others), 0, -1)
-        weights = time_weights(ages, np.array([self.looks[k][1] for k in others]), constants)
+        weights = time_weights(ages, np.array([self.summaries[k][1] for k in others]), constants)
         rng = np.random.default_rng([self.seed, view.frame_id])
-        return [view.frame_id, *(others[i] for i in select(overlaps, differs, weights, rng, constants))]
+        return [view.frame_id, *(others[i] for i in select_keyframes(overlaps, differs, weights, rng, constants))]
 
     def _adjust(self, view_of: Callable[[int], View], camera: Intrinsics, constants: Constants) -> None:
         """(25) over the last keyframes; the Gaussians and the frames between move with them."""
@@ -175,8 +174,8 @@ class Slam:
             "unit": torch.tensor(self.unit, dtype=torch.float64), "posed": torch.tensor(list(self.poses)),
             "poses": torch.stack(list(self.poses.values())), "keyframes": torch.tensor(self.keyframes),
             "fields": torch.from_numpy(np.stack(list(self.fields.values()))),
-            "labels": torch.from_numpy(np.stack([labels for labels, _ in self.looks.values()])),
-            "trust": torch.tensor([trust for _, trust in self.looks.values()], dtype=torch.float64),
+            "labels": torch.from_numpy(np.stack([labels for labels, _ in self.summaries.values()])),
+            "trust": torch.tensor([trust for _, trust in self.summaries.values()], dtype=torch.float64),
             "lost": torch.tensor(list(self.lost), dtype=torch.int64),
         }  # fmt: skip
         return {**self.gaussians.to_tensors(), **numbers}
@@ -187,8 +186,8 @@ class Slam:
         keyframes = tensors["keyframes"].tolist()
         self.poses = dict(zip(tensors["posed"].tolist(), tensors["poses"], strict=True))
         self.fields = dict(zip(keyframes, tensors["fields"].numpy(), strict=True))
-        looks = zip(tensors["labels"].numpy(), tensors["trust"].tolist(), strict=True)
-        self.looks = dict(zip(keyframes, looks, strict=True))
+        summaries = zip(tensors["labels"].numpy(), tensors["trust"].tolist(), strict=True)
+        self.summaries = dict(zip(keyframes, summaries, strict=True))
         self.lost = dict.fromkeys(tensors["lost"].tolist(), "the map covers too little of it")
 
 
@@ -197,7 +196,7 @@ def _rotated(pose: Tensor) -> Tensor:
     return torch.from_numpy(se3.exp(se3.log(pose.numpy())))
 
 
-def _looks(view: View) -> tuple[NDArray[np.uint8], float]:
+def _summary(view: View) -> tuple[NDArray[np.uint8], float]:
     height, width = view.depth.shape
     size = _GRID if width >= height else _GRID[::-1]
     labels = np.asarray(cv2.resize(view.channels.numpy(), size, interpolation=cv2.INTER_NEAREST), np.uint8)

@@ -22,11 +22,9 @@ from ..geometry import se3
 from ..geometry.camera import project
 from ..geometry.se3 import Similarity
 from ..geometry.sparse_model import SparseModel
-from ..global_ba.candidates import summarise_labels
-from ..mapping.load import load_view, survey
 from ..mapping.measure import ViewFigures, mean_figures, measure_view
 from ..mapping.move_map import follow_keyframes, move_map
-from ..mapping.views import View
+from ..mapping.views import View, load_view, survey
 from ..render.gaussian_map import GaussianMap
 from ..run.files import (
     CALIBRATION,
@@ -47,11 +45,19 @@ from ..system.parallel import LruSequence
 from ..system.progress import is_asked
 from ..system.wording import stretches
 from ..types import Frame, Intrinsics, LoopEdge, Trajectory
-from .adjustment import beside, carry, global_adjustment, pose_graph
+from .adjustment import (
+    adjust_frame,
+    carry,
+    close_semantic_loops,
+    global_adjustment,
+    pose_graph,
+    semantic_candidates,
+    small_descriptors,
+    summarise_labels,
+)
 from .constants import constants_of
-from .gaussians import Gaussians, scaled_depth
-from .loops import candidates, close, small_looks
 from .mapping import draw_together, optimise
+from .rendering import Gaussians, scaled_depth
 from .slam import Slam
 from .uncertainty import proxy_depth
 
@@ -66,10 +72,10 @@ MAP_PASSES, FINE_PASSES = 1, 12
 """Visits of each keyframe: in `mapping`, and at full size once poses and depths are adjusted."""
 
 
-def track(context: StageContext) -> dict[str, Any]:
+def track_by_map(context: StageContext) -> dict[str, Any]:
     """Poses of all frames, and the map that they were found with."""
     _warn(context)
-    recording, snapshot = Recording(context), context.snapshot / "slam.safetensors"
+    recording, snapshot = FrameViews(context), context.snapshot / "slam.safetensors"
     slam, done = Slam(len(recording.class_ids), context.config.run.seed), 0
     if snapshot.exists():
         held = load_tensors(snapshot)
@@ -119,11 +125,11 @@ def _warn(context: StageContext) -> None:
 
 def map_keyframes(context: StageContext) -> dict[str, Any]:
     """Every keyframe visited once more, eq. (18)."""
-    recording, run = Recording(context), context.run
+    recording, run = FrameViews(context), context.run
     trajectory, fields = run.load(TRAJECTORY, "tracking"), run.load(DEPTH_FIELDS, "tracking")
     gaussians = Gaussians.of(run.load(MAP, "tracking"))
     ids = trajectory.frame_ids[trajectory.is_keyframe].tolist()
-    mirror = draw_together(gaussians, scene_depth(recording, ids, fields), context.config.run.seed)
+    mirror = draw_together(gaussians, scene_unit(recording, ids, fields), context.config.run.seed)
     _visit(context, recording, gaussians, trajectory, fields, MAP_PASSES, "mapping")
     MAP.save(context.folder, gaussians.map)
     TRAJECTORY.save(context.folder, trajectory)
@@ -138,13 +144,13 @@ def map_keyframes(context: StageContext) -> dict[str, Any]:
 
 
 def _visit(
-    context: StageContext, recording: Recording, gaussians: Gaussians, trajectory: Trajectory, fields: DepthFields,
+    context: StageContext, recording: FrameViews, gaussians: Gaussians, trajectory: Trajectory, fields: DepthFields,
     passes: int, label: str, begin: int = 0, after: Callable[[int], None] = lambda done: None,
 ) -> None:  # fmt: skip
     """Adam on (18), keyframe by keyframe in random order, its rate falling; `after` each pass."""
     ids, seed = trajectory.frame_ids[trajectory.is_keyframe].tolist(), context.config.run.seed
     poses = dict(zip(trajectory.frame_ids.tolist(), trajectory.cam_from_world, strict=True))
-    unit, constants = scene_depth(recording, ids, fields), constants_of(context.config)
+    unit, constants = scene_unit(recording, ids, fields), constants_of(context.config)
     for number in range(begin, passes):
         order = np.random.default_rng([seed, number, 2]).permutation(ids).tolist()
         for k, i in enumerate(context.progress.track(order, label, len(order))):
@@ -154,14 +160,14 @@ def _visit(
         after(number + 1)
 
 
-def scene_depth(recording: Recording, ids: list[int], fields: DepthFields) -> float:
+def scene_unit(recording: FrameViews, ids: list[int], fields: DepthFields) -> float:
     """Find the median depth of the first keyframe, the unit of all depth terms."""
     depth = recording.scaled(ids[0], fields).depth
     return float(depth[depth > 0].median())
 
 
 def _measure(
-    recording: Recording, gaussian_map: GaussianMap, trajectory: Trajectory, fields: DepthFields
+    recording: FrameViews, gaussian_map: GaussianMap, trajectory: Trajectory, fields: DepthFields
 ) -> dict[str, float]:
     found: dict[str, list[ViewFigures]] = {"keyframe": [], "held_out": []}
     keys = set(trajectory.frame_ids[trajectory.is_keyframe].tolist())
@@ -185,7 +191,7 @@ def _save_exposure(context: StageContext, trajectory: Trajectory) -> None:
 
 def close_and_adjust(context: StageContext) -> dict[str, Any]:
     """Loops (21) to (24), then poses and depths together (26), then the map at full size."""
-    recording, run = Recording(context), context.run
+    recording, run = FrameViews(context), context.run
     trajectory, fields = run.load(TRAJECTORY, "mapping"), run.load(DEPTH_FIELDS, "tracking")
     gaussian_map = run.load(MAP, "mapping")
     tried, loops = _loops(context, recording, trajectory, fields, gaussian_map)
@@ -207,7 +213,7 @@ def close_and_adjust(context: StageContext) -> dict[str, Any]:
 
 
 def _loops(
-    context: StageContext, recording: Recording, trajectory: Trajectory, fields: DepthFields, gaussian_map: GaussianMap
+    context: StageContext, recording: FrameViews, trajectory: Trajectory, fields: DepthFields, gaussian_map: GaussianMap
 ) -> tuple[int, list[LoopEdge]]:
     """Return how many candidates there are, and the loops among them; kept in a snapshot."""
     if not context.config.global_ba.use_loops:
@@ -219,13 +225,15 @@ def _loops(
     summaries = [summarise_labels(m.labels, classes) for m in maps.values() if m is not None]
     learned = context.run.find(DESCRIPTORS) or {}
     known = all(i in learned for i in ids)
-    looks: NDArray = np.stack([learned[i] for i in ids]) if known else small_looks([recording.views[i] for i in ids])
-    pairs = candidates(summaries, looks, constants_of(context.config))
+    descriptors: NDArray = (
+        np.stack([learned[i] for i in ids]) if known else small_descriptors([recording.views[i] for i in ids])
+    )
+    pairs = semantic_candidates(summaries, descriptors, constants_of(context.config))
     if kept is not None:
         return len(pairs), kept
     poses = trajectory.cam_from_world[trajectory.is_keyframe]
-    unit = scene_depth(recording, ids, fields)
-    found = close(
+    unit = scene_unit(recording, ids, fields)
+    found = close_semantic_loops(
         context.progress.track(pairs, "loops", len(pairs)), ids, poses, lambda n: recording.scaled(ids[n], fields),
         Gaussians.of(gaussian_map), len(recording.class_ids), unit,
     )  # fmt: skip
@@ -234,12 +242,12 @@ def _loops(
 
 
 def _closed(
-    recording: Recording, trajectory: Trajectory, fields: DepthFields, gaussian_map: GaussianMap, loops: list[LoopEdge]
+    recording: FrameViews, trajectory: Trajectory, fields: DepthFields, gaussian_map: GaussianMap, loops: list[LoopEdge]
 ) -> tuple[Trajectory, GaussianMap]:
     """Spread the drift that loops show; Gaussians and frames move with their keyframes."""
     ids, old = trajectory.frame_ids[trajectory.is_keyframe], trajectory.cam_from_world[trajectory.is_keyframe]
     place = {frame_id: n for n, frame_id in enumerate(ids.tolist())}
-    new, _ = pose_graph(old, loops, place, scene_depth(recording, ids.tolist(), fields))
+    new, _ = pose_graph(old, loops, place, scene_unit(recording, ids.tolist(), fields))
     return _following(trajectory, new), move_map(gaussian_map, ids, old, new, np.ones(len(ids)))
 
 
@@ -253,7 +261,7 @@ def _following(trajectory: Trajectory, new: NDArray[np.float64]) -> Trajectory:
 
 
 def _adjusted(
-    context: StageContext, recording: Recording, trajectory: Trajectory, fields: DepthFields, gaussian_map: GaussianMap
+    context: StageContext, recording: FrameViews, trajectory: Trajectory, fields: DepthFields, gaussian_map: GaussianMap
 ) -> tuple[Gaussians, Trajectory, DepthFields]:
     """(26), the world brought back to the proxies' scale, then (18) at full size; goes on from the last pass."""
     snapshot = context.snapshot / "adjusted.safetensors"
@@ -265,7 +273,7 @@ def _adjusted(
     else:
         done, gaussians = 0, Gaussians.of(gaussian_map)
         old, own = trajectory.cam_from_world[trajectory.is_keyframe], np.stack([fields.of_frame[i] for i in ids])
-        unit, classes = scene_depth(recording, ids, fields), len(recording.class_ids)
+        unit, classes = scene_unit(recording, ids, fields), len(recording.class_ids)
         constants = constants_of(context.config)
         poses, bent = global_adjustment(recording.views.__getitem__, ids, old, own, classes, unit, constants)
         carry(gaussians, ids, old, poses, bent - own, recording.camera)
@@ -283,15 +291,15 @@ def _adjusted(
     resized[~trajectory.is_posed] = np.eye(4)
     trajectory = replace(trajectory, cam_from_world=resized)
     fields = DepthFields(dict(zip(ids, bent + shrunk, strict=True)))
-    fine = Recording(context, context.config.mapping.max_side)
+    fine = FrameViews(context, context.config.mapping.max_side)
     _visit(context, fine, gaussians, trajectory, fields, FINE_PASSES, "mapping", done, save)
     return gaussians, trajectory, fields
 
 
-def _between(context: StageContext, recording: Recording, trajectory: Trajectory, fields: DepthFields) -> Trajectory:
+def _between(context: StageContext, recording: FrameViews, trajectory: Trajectory, fields: DepthFields) -> Trajectory:
     """(25) for each frame that is no keyframe and its two neighbours that are, of which only the frame moves."""
     keys, poses = trajectory.frame_ids[trajectory.is_keyframe], trajectory.cam_from_world.copy()
-    unit = scene_depth(recording, keys.tolist(), fields)
+    unit = scene_unit(recording, keys.tolist(), fields)
     row = {i: n for n, i in enumerate(trajectory.frame_ids.tolist())}
     views, classes, constants = recording.views.__getitem__, len(recording.class_ids), constants_of(context.config)
     left = trajectory.frame_ids[trajectory.is_posed & ~trajectory.is_keyframe].tolist()
@@ -300,11 +308,11 @@ def _between(context: StageContext, recording: Recording, trajectory: Trajectory
         ids = [*keys[max(after - 1, 0) : after + 1].tolist(), i]
         own = np.stack([fields.of_frame[k] for k in [*ids[:-1], ids[0]]])
         where = np.stack([poses[row[k]] for k in ids])
-        poses[row[i]] = beside(views, ids, where, own, classes, unit, constants)
+        poses[row[i]] = adjust_frame(views, ids, where, own, classes, unit, constants)
     return replace(trajectory, cam_from_world=poses)
 
 
-class Recording:
+class FrameViews:
     """The frames of a run, as views at a size; `held`: ids of those that only measure the map."""
 
     def __init__(self, context: StageContext, side: int = WORKING_SIDE) -> None:

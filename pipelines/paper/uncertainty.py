@@ -23,7 +23,7 @@ def proxy_depth(run: RunFolder, frame_id: int) -> ProxyMaps | None:
     return run.find_proxy(frame_id)
 
 
-def reliability(
+def depth_reliability(
     depth: NDArray[np.float32], confidence: NDArray[np.float32], theta: float = 1.0, constants: Constants = PAPER
 ) -> NDArray[np.float32]:
     """Eq. (2): U = exp(-α‖∇D̂‖²) · Conf^β · θ^γ, (h, w) in [0, 1] of depth and confidence (h, w); 0 at unknown depth.
@@ -36,7 +36,7 @@ def reliability(
     return np.asarray(np.where(depth > 0, with_agreement(u, theta, constants), 0), np.float32)
 
 
-def agreement(miou: float, constants: Constants = PAPER) -> float:
+def semantic_factor(miou: float, constants: Constants = PAPER) -> float:
     """Eq. (3): θ = 1 / (1 + exp(-λ(m_t - φ))) of the mIoU m_t of a frame's classes with those that the map shows."""
     return float(1 / (1 + np.exp(-constants.steepness * (miou - constants.phi))))
 
@@ -78,9 +78,9 @@ def mirror_plane(points: Array, classes: NDArray[np.integer], tolerance: float, 
             continue
         normal = (second - first) / apart
         offset = float(normal @ (first + second) / 2)
-        beside = np.abs(points @ normal - offset) > 2 * tolerance  # what lies on the plane mirrors itself
+        apart_from_plane = np.abs(points @ normal - offset) > 2 * tolerance  # what lies on the plane mirrors itself
         near, _ = tree.query(mirrored(spaced, normal, offset), distance_upper_bound=tolerance)
-        shares.append(float((np.isfinite(near) & beside).sum()) / len(points))
+        shares.append(float((np.isfinite(near) & apart_from_plane).sum()) / len(points))
         planes.append((normal, offset))
     if not planes:
         return MirrorPlane(np.array([1.0, 0, 0]), 0.0, 0.0)

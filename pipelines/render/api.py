@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -14,10 +14,12 @@ from ..compute import gpu
 from ..compute.threads import PART, for_each, fused_kernel
 from ..geometry import se3
 from ..geometry.camera import project_gaussians
+from ..system.machine import has_triton
 from ..types import Intrinsics
-from . import reference
-from .notes import Notes
+from . import rules
+from .rules import GaussianStats
 
+Backend: TypeAlias = str | ModuleType | None
 NEAR = 0.01
 """Gaussians whose centre is nearer than this (or behind the camera) are not drawn; in the unit of the map."""
 
@@ -40,34 +42,34 @@ def render(
     intrinsics: Intrinsics,
     twist: Tensor | None = None,
     near: float = NEAR,
-    backend: str | None = None,
-    notes: Notes | None = None,
+    backend: Backend = None,
+    stats: GaussianStats | None = None,
 ) -> Rendering:
     """Draw M Gaussians from the pose exp(twist) @ cam_from_world; differentiable in all of them.
 
     means (M, 3), radii (M,) world standard deviations, opacities (M,) 0..1, features (M, C), cam_from_world (4, 4),
     twist (6,) translation first (see `pipelines.geometry.se3`). Pose and twist best stay on the host where the
-    Gaussians lie on a card: on six numbers a card is slower. The backward pass fills the notes. Raises
+    Gaussians lie on a card: on six numbers a card is slower. The backward pass fills `stats`. Raises
     ValueError for wrong shapes, and for NaN and infinity in what lies on the CPU.
     """
     pose = cam_from_world if twist is None else moved(cam_from_world, twist)
     if (kernels := kernels_for(backend, means)) is not None:
         size = (intrinsics.width, intrinsics.height)
         check_arguments({"radii": radii, "opacities": opacities, "features": features}, *size)
-        records = kernels.project(means, radii, opacities, beside(pose, means), intrinsics, near)
-        shown, above, below, silhouette = kernels.composite_records(records, features, *size, notes=notes)
+        records = kernels.project(means, radii, opacities, placed_as(pose, means), intrinsics, near)
+        shown, above, below, silhouette = kernels.composite_records(records, features, *size, stats=stats)
         return Rendering(shown, kernels.depth_ratio(above, below), silhouette)
     if not torch.is_grad_enabled():
         rows = in_view(means, radii, pose, intrinsics, near)
         means, radii, opacities, features = (x.index_select(0, rows) for x in (means, radii, opacities, features))
     u, v, sigma_px, z = project_map(means, radii, pose, intrinsics, near)
     size = (intrinsics.width, intrinsics.height)
-    image = composite(u, v, sigma_px, z, opacities, features, *size, backend, near, notes)
+    image = composite(u, v, sigma_px, z, opacities, features, *size, backend, near, stats)
     depth = depth_ratio(image.depth_sum, image.depth_silhouette)
     return Rendering(image.features, depth, image.silhouette)
 
 
-def kernels_for(backend: str | None, example: Tensor) -> ModuleType | None:
+def kernels_for(backend: Backend, example: Tensor) -> ModuleType | None:
     """Return the kernels that also project, where tensors like `example` take them; they cull themselves."""
     if backend != "cuda" and (backend is not None or not gpu.supports_triton(example)):
         return None
@@ -90,19 +92,19 @@ def project_map(
     if means.device.type == "cpu" and means.dtype == torch.float32:
         from .cpu_projection import project  # imports numba
 
-        return project(means, radii, beside(cam_from_world, means), intrinsics, near)
-    points_in_cam = se3.transform(beside(cam_from_world, means), means)
+        return project(means, radii, placed_as(cam_from_world, means), intrinsics, near)
+    points_in_cam = se3.transform(placed_as(cam_from_world, means), means)
     return project_gaussians(points_in_cam, radii, intrinsics, near)
 
 
-def beside(numbers: Tensor, other: Tensor) -> Tensor:
+def placed_as(numbers: Tensor, other: Tensor) -> Tensor:
     """Return `numbers` on the device and in the type of `other`; the gradient comes back in one copy."""
     if numbers.device == other.device:
         return numbers.to(other)
-    return _Beside.apply(numbers, other)
+    return _PlacedAs.apply(numbers, other)
 
 
-class _Beside(torch.autograd.Function):
+class _PlacedAs(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, numbers: Tensor, other: Tensor) -> Tensor:
         ctx.device, ctx.dtype = numbers.device, numbers.dtype
@@ -142,21 +144,21 @@ def composite(
     features: Tensor,
     width: int,
     height: int,
-    backend: str | None = None,
+    backend: Backend = None,
     near: float = 0.0,
-    notes: Notes | None = None,
+    stats: GaussianStats | None = None,
 ) -> Composite:
     """Blend M Gaussians into a width x height image; differentiable in the first six arguments.
 
     u, v, sigma_px (M,) pixels, pixel centres at half integers; z (M,) depth, ignored where <= near; opacity (M,) 0..1;
-    features (M, C). backend: "reference", "cpu", "cuda" or None for the fastest that runs these tensors. notes: filled
-    by the backward pass. Raises
+    features (M, C). backend: "cpu", "cuda", a module with the same functions, or None for the one that runs these
+    tensors. stats: filled by the backward pass. Raises
     ValueError for wrong shapes, for NaN or infinity on the CPU (by the argument's name) and for an unknown backend.
     """
     arguments = {"u": u, "v": v, "sigma_px": sigma_px, "z": z, "opacity": opacity, "features": features}
     check_arguments(arguments, width, height)
     module = choose_backend(backend, u)
-    return Composite(*module.composite(u, v, sigma_px, z, opacity, features, width, height, float(near), notes))
+    return Composite(*module.composite(u, v, sigma_px, z, opacity, features, width, height, float(near), stats))
 
 
 def check_arguments(arguments: dict[str, Tensor], width: int, height: int) -> None:
@@ -194,28 +196,33 @@ def require_all_finite(tensors: Mapping[str, Tensor]) -> None:
             raise ValueError(f"{name}: {bad} of {tensor.numel()} values are NaN or infinite")
 
 
-def choose_backend(backend: str | None, example: Tensor) -> ModuleType:
-    """Return the module that composites tensors like `example`; without a choice, the fastest that can."""
-    name = backend or _fastest(example)
-    if name == "reference":
-        return reference
+def choose_backend(backend: Backend, example: Tensor) -> ModuleType:
+    """Return the module that composites tensors like `example`; without a choice, the one that can."""
+    if isinstance(backend, ModuleType):
+        return backend
+    name = backend or _able(example)
     if name == "cpu":
         from . import cpu  # importing numba takes a while: only where it is used
 
         return cpu
     if name == "cuda":
-        if not gpu.has_triton():
+        if not has_triton():
             raise ValueError("backend: 'cuda' needs triton >= 3.3, which comes with torch >= 2.7 built for CUDA")
         from . import cuda
 
         return cuda
-    raise ValueError(f"backend: got {backend!r}, expected 'reference', 'cpu', 'cuda' or None")
+    raise ValueError(f"backend: got {backend!r}, expected 'cpu', 'cuda', a module or None")
 
 
-def _fastest(example: Tensor) -> str:
+def _able(example: Tensor) -> str:
     if example.device.type == "cpu" and example.dtype == torch.float32:
         return "cpu"
-    return "cuda" if gpu.supports_triton(example) else "reference"
+    if gpu.supports_triton(example):
+        return "cuda"
+    raise ValueError(
+        f"nothing renders {example.dtype} on {example.device}: float32 is rendered on a CPU, and on an NVIDIA card of "
+        "compute capability 8.0 and more with triton >= 3.3"
+    )
 
 
 @torch.no_grad()
@@ -239,7 +246,7 @@ def in_view(means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: In
     if gpu.supports_triton(means):
         return torch.nonzero(marked_in_view(means, radii, pose, k, near))[:, 0]
     u, v, sigma_px, z = project_gaussians(se3.transform(pose, means), radii, k, near)
-    reach = reference.CUT_SIGMAS * sigma_px + 1
+    reach = rules.CUT_SIGMAS * sigma_px + 1
     seen = (z > near) & (u > -reach) & (u < k.width + reach) & (v > -reach) & (v < k.height + reach)
     return torch.nonzero(seen)[:, 0]
 
@@ -260,7 +267,7 @@ def _list_in_view(
 ) -> NDArray[np.int64]:  # fmt: skip
     """See `in_view`; camera: fx, fy, cx, cy, width, height, near; the first of these is Gaussian number `start`."""
     fx, fy, cx, cy, width, height, near = camera
-    focal = np.sqrt(fx * fy) * np.float32(reference.CUT_SIGMAS)
+    focal = np.sqrt(fx * fy) * np.float32(rules.CUT_SIGMAS)
     out, count = np.empty(len(means), np.int64), 0
     for i in range(len(means)):
         x, y, z = means[i]

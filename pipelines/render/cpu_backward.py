@@ -12,25 +12,35 @@ from numpy.typing import NDArray
 
 from ..compute.lanes import add_totals, load, maximum, reciprocal, reduce_max, splat, store, total, where
 from ..compute.threads import PART, for_each, fused_kernel, inlined, inner
-from . import reference
-from .cpu_bands import PIXELS, RECORD, TILE, Bands, clear, for_each_band, row_opacity, walk_tiles
-from .cpu_forward import Vectors, vectors_for
+from . import rules
+from .cpu_bands import (
+    PIXELS,
+    RECORD,
+    TILE,
+    ImageBands,
+    Vectors,
+    clear,
+    for_each_band,
+    row_opacity,
+    vectors_for,
+    walk_tiles,
+)
 
 F32 = np.float32
 BEHIND, D_DEPTH, D_SEEN, WEIGHTS, ERROR, COUNT = (PIXELS * i for i in range(6))
 """Planes of a tile's state: what is still behind; the gradients of depth sum and silhouette; weights of a Gaussian;
-the errors of the pixels and what they count, where somebody asks for `Notes`."""
+the errors of the pixels and what they count, where `GaussianStats` are asked for."""
 PLANES = 6
 COLORS = 3
 GEOMETRY = 5
 """u, v, sigma_px, z, opacity."""
 
-_ALPHA_MAX = F32(reference.ALPHA_MAX)
+_ALPHA_MAX = F32(rules.ALPHA_MAX)
 _HALF, _ZERO, _ONE = F32(0.5), F32(0), F32(1)
 
 
 def pull_back(
-    bands: Bands, features: NDArray[np.float32], planes: NDArray[np.float32], d_features: NDArray[np.float32],
+    bands: ImageBands, features: NDArray[np.float32], planes: NDArray[np.float32], d_features: NDArray[np.float32],
     d_planes: NDArray[np.float32], marks: NDArray[np.float32] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
     """Return the gradients of the Gaussians' u, v, sigma_px, z, opacity (5, M) and of their features (M, C); and (M, 2)
@@ -95,7 +105,7 @@ def pull_alpha(
 
 
 @inlined
-def pull(
+def pull_gradients(
     job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.float32], falloff_y: NDArray[np.float32], i: int,
     box: tuple[int, ...], pair: tuple[Any, ...],
 ) -> None:  # fmt: skip
@@ -206,10 +216,10 @@ def backward_band(
     size, features_at = (8, GEOMETRY) if vectors is None else (8 + lanes_used, 8)
     d_records = np.zeros(size * len(own), np.float32)
     image = np.zeros(PIXELS * (COLORS if vectors is None else lanes_used), np.float32)
-    notes = np.zeros((len(own) if marks.size > 0 else 0, 2), np.float32)
+    stats = np.zeros((len(own) if marks.size > 0 else 0, 2), np.float32)
     state = np.empty(PIXELS * PLANES, np.float32)
-    job = (state, image, d_records, padded, features, planes, d_image, d_planes, marks, notes)
-    visitors = (open_gradients, pull, close_gradients)
+    job = (state, image, d_records, padded, features, planes, d_image, d_planes, marks, stats)
+    visitors = (open_gradients, pull_gradients, close_gradients)
     walk_tiles(visitors, job, vectors, band, tile_starts, members, records, width, height)
     for k in range(len(own)):
         i, at = own[k], size * k
@@ -226,14 +236,14 @@ def backward_band(
             for c in range(used):
                 row[GEOMETRY + c] = d_records[at + features_at + c]
             for j in range(2 if marks.size > 0 else 0):
-                noted_apart[slots[i] + band - first[i], j] = notes[k, j]
+                noted_apart[slots[i] + band - first[i], j] = stats[k, j]
         else:
             for j in range(GEOMETRY):
                 d_geometry[j, i] = d_records[at + j]
             for c in range(used):
                 d_features[i, c] = d_records[at + features_at + c]
             for j in range(2 if marks.size > 0 else 0):
-                noted[i, j] = notes[k, j]
+                noted[i, j] = stats[k, j]
 
 
 @fused_kernel

@@ -7,14 +7,14 @@ state of its pixels in planes of `PIXELS` numbers, row after row of `TILE`.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compute.lanes import any_of, exp, iota, load, maximum, min_scalar, splat, store, where
+from ..compute.lanes import any_lane, exp, iota, load, maximum, min_scalar, splat, store, where
 from ..compute.threads import PART, for_each, fused_kernel, inner
-from . import reference
+from . import rules
 
 F32 = np.float32
 TILE = 16
@@ -23,14 +23,30 @@ BAND_ROWS = 32  # two rows of tiles: more would leave threads idle at the end, f
 RECORD = 6
 """Numbers kept per Gaussian of a band: u, v, sigma_px, z, opacity, reach."""
 
+Vectors: TypeAlias = tuple[int, ...] | None
+"""A tuple with one 0 per sixteen channels of a pixel, which lie side by side: its type tells the kernels how many
+vectors a pixel has. None for three channels, which lie in planes as the rest of a tile's state does:
+one vector is sixteen pixels of a channel instead of a pixel's sixteen channels, at two thirds of the time."""
+
 CHECK_EVERY = 32
 """Gaussians between two looks at whether the whole tile is opaque."""
 
-_ALPHA_MIN, _CUT2 = F32(reference.ALPHA_MIN), F32(reference.CUT_SIGMAS**2)
-_ALPHA_MAX, _MIN_TRANSMITTANCE = F32(reference.ALPHA_MAX), F32(reference.TRANSMITTANCE_MIN)
+_ALPHA_MIN, _CUT2 = F32(rules.ALPHA_MIN), F32(rules.CUT_SIGMAS**2)
+_ALPHA_MAX, _MIN_TRANSMITTANCE = F32(rules.ALPHA_MAX), F32(rules.TRANSMITTANCE_MIN)
 _HALF, _ZERO, _ONE, _TWO = F32(0.5), F32(0), F32(1), F32(2)
-_WIDE, _CUT = F32(1.001 * reference.ALPHA_MIN * math.exp(reference.CUT_SIGMAS**2 / 2)), F32(reference.CUT_SIGMAS)
+_WIDE, _CUT = F32(1.001 * rules.ALPHA_MIN * math.exp(rules.CUT_SIGMAS**2 / 2)), F32(rules.CUT_SIGMAS)
 """Gaussians more opaque than the first reach as far as any: to so many deviations."""
+
+
+def vectors_for(channels: int) -> Vectors:
+    """Return how so many channels of a pixel lie."""
+    return None if channels == 3 else (0,) * max(1, (channels + 15) // 16)
+
+
+def padded_channels(channels: int) -> int:
+    """Return how many numbers a tile keeps of a pixel's channels, and a band of a Gaussian's."""
+    vectors = vectors_for(channels)
+    return 3 if vectors is None else 16 * len(vectors)
 
 
 @inner
@@ -46,7 +62,7 @@ def last_pixel(high: np.float32, size: int) -> np.int32:
 
 
 @dataclass(frozen=True)
-class Bands:
+class ImageBands:
     """What the bands of an image see. Band b sees the Gaussians entries[starts[b]:starts[b + 1]], near to far.
 
     first (M,): the first band of a Gaussian; slots (M + 1,): Gaussians in several bands own the places
@@ -86,10 +102,10 @@ def split_into_bands(
     width: int,
     height: int,
     near: float,
-) -> Bands:
+) -> ImageBands:
     """Sort out all about the Gaussians u, v, sigma_px, z, opacity (M,) and features (M, C) that bands need to know."""
     reach, first, starts, entries, slots = bin_gaussians(projected, width, height, near)
-    bands = Bands(first, starts, entries, slots, [None] * (len(starts) - 1))  # type: ignore[list-item]
+    bands = ImageBands(first, starts, entries, slots, [None] * (len(starts) - 1))  # type: ignore[list-item]
 
     def prepare(band: int) -> None:
         top = band * BAND_ROWS
@@ -106,7 +122,7 @@ def bin_gaussians(
     projected: tuple[NDArray[np.float32], ...], width: int, height: int, near: float
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
     """Find how far from its centre each Gaussian is seen, in pixels (M,), 0 where it is not seen at all; and the first
-    four fields of `Bands`, entries in the order of their indices."""
+    four fields of `ImageBands`, entries in the order of their indices."""
     count, bands, parts = len(projected[0]), -(-height // BAND_ROWS), -(-len(projected[0]) // PART)
     reach, (first, last) = np.empty(count, np.float32), np.empty((2, count), np.int32)
     counts = np.zeros((parts, bands), np.int64)
@@ -285,7 +301,7 @@ def is_opaque(light: NDArray[np.float32]) -> bool:
     most = load(light, 0)
     for y in range(1, TILE):
         most = maximum(most, load(light, TILE * y))
-    return not any_of(most >= _MIN_TRANSMITTANCE)
+    return not any_lane(most >= _MIN_TRANSMITTANCE)
 
 
 @inner
@@ -323,7 +339,7 @@ def walk_tiles(
         job: what the visitors work on.
         kind: handed to them apart from the job: its type may decide which of their branches are compiled.
         band: number of the band.
-        tile_starts, members, records: of the band, see `Bands`.
+        tile_starts, members, records: of the band, see `ImageBands`.
         width, height: of the image.
     """
     open_tile, visit, close_tile = visitors

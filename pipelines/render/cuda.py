@@ -11,10 +11,10 @@ import triton.language as tl
 from torch import Tensor
 
 from ..compute import gpu
-from . import reference
+from . import rules
 from .cuda_kernels import backward_tile, divide_back_pixels, divide_pixels, forward_tile, inspect_tile
 from .cuda_projection import project, record
-from .notes import Notes
+from .rules import GaussianStats
 
 __all__ = ["composite", "composite_records", "depth_ratio", "inspect", "inspect_records", "list_tiles", "project"]
 
@@ -36,20 +36,20 @@ def composite(
     width: int,
     height: int,
     near: float,
-    notes: Notes | None = None,
+    stats: GaussianStats | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the feature image (H, W, C), depth sum, depth silhouette and silhouette (H, W) of tensors on one GPU."""
     records = record((u, v, sigma_px, z, opacity), width, height, near)
-    return composite_records(records, features, width, height, notes)
+    return composite_records(records, features, width, height, stats)
 
 
 def composite_records(
-    records: Tensor, features: Tensor, width: int, height: int, notes: Notes | None = None
+    records: Tensor, features: Tensor, width: int, height: int, stats: GaussianStats | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The same of the Gaussians' records (M, 6); the backward pass fills the notes."""
+    """The same of the Gaussians' records (M, 6); the backward pass fills the stats."""
     if features.dtype != torch.float32:
         raise ValueError(f"the cuda backend renders float32, got {features.dtype}")
-    return _Composite.apply(records, features, width, height, notes)
+    return _Composite.apply(records, features, width, height, stats)
 
 
 def inspect(
@@ -86,7 +86,7 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         records, features = (x.detach().contiguous() for x in arguments[:2])
-        width, height, ctx.notes = arguments[2:]
+        width, height, ctx.stats = arguments[2:]
         starts, members = list_tiles(records, width, height)
         image = features.new_empty(height, width, features.shape[1])
         planes = [features.new_empty(height, width) for _ in range(3)]
@@ -104,9 +104,9 @@ class _Composite(torch.autograd.Function):
         saved = ctx.saved_tensors
         inputs, images = saved[:4], saved[4:]
         starts, members, records, features = inputs
-        if ctx.notes is not None:
+        if ctx.stats is not None:
             width, height, _ = ctx.size
-            ctx.notes.fill(lambda counts: inspect_records(records, width, height, counts, (starts, members)))
+            ctx.stats.fill(lambda counts: inspect_records(records, width, height, counts, (starts, members)))
         upstream = [
             torch.zeros_like(image) if gradient is None else gradient.contiguous()
             for image, gradient in zip(images, gradients, strict=True)
@@ -145,8 +145,8 @@ def _settings(channels: int) -> dict[str, Any]:
         "PADDED": padded,
         "STEP": STEP,
         "TILE": TILE,
-        "ALPHA_MAX": reference.ALPHA_MAX,
-        "LIGHT_MIN": reference.TRANSMITTANCE_MIN,
+        "ALPHA_MAX": rules.ALPHA_MAX,
+        "LIGHT_MIN": rules.TRANSMITTANCE_MIN,
         "num_warps": _WARPS,
     }
 

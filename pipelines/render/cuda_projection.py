@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..compute import gpu
 from ..types import Intrinsics
-from . import reference
+from . import rules
 
 RECORD = 6
 """Numbers of a record."""
@@ -42,7 +42,7 @@ def mark_in_view(means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsic
     return marks
 
 
-_CUT = {"CUT_SIGMAS": reference.CUT_SIGMAS}
+_CUT = {"CUT_SIGMAS": rules.CUT_SIGMAS}
 
 
 def _camera(k: Intrinsics, near: float) -> tuple[float, ...]:
@@ -60,7 +60,7 @@ class _Projected(torch.autograd.Function):
         ctx.camera = _camera(*arguments[4:])
         records = means.new_empty(len(means), RECORD)
         given = (means, radii, opacities, pose, records)
-        _run(project_rows, len(means), *given, *ctx.camera, ALPHA_MIN=reference.ALPHA_MIN, **_CUT)
+        _run(project_rows, len(means), *given, *ctx.camera, ALPHA_MIN=rules.ALPHA_MIN, **_CUT)
         ctx.save_for_backward(means, radii, pose)
         return records
 
@@ -81,7 +81,7 @@ class _Recorded(torch.autograd.Function):
         given = [x.detach().contiguous() for x in geometry]
         records = given[0].new_empty(len(given[0]), RECORD)
         _run(
-            record_rows, len(records), *given, records, width, height, near, ALPHA_MIN=reference.ALPHA_MIN, **_CUT
+            record_rows, len(records), *given, records, width, height, near, ALPHA_MIN=rules.ALPHA_MIN, **_CUT
         )  # fmt: skip
         return records
 
@@ -120,7 +120,7 @@ def store_record(
     opacity: tl.tensor, width: tl.tensor, height: tl.tensor, near: tl.tensor,
     ALPHA_MIN: tl.constexpr, CUT_SIGMAS: tl.constexpr,
 ) -> None:  # fmt: skip
-    """Store them with their reaches; see `reference`."""
+    """Store them with their reaches; see `rules`."""
     reach2 = tl.minimum(2.0 * tl.log(tl.maximum(opacity / ALPHA_MIN, 1.0)), CUT_SIGMAS * CUT_SIGMAS)
     reach = tl.maximum(sigma, 0.0) * tl.sqrt(reach2)
     seen = (z > near) & (u + reach >= 0.5) & (u - reach <= width - 0.5)

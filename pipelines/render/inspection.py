@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ..types import Intrinsics
-from .api import NEAR, choose_backend, depth_ratio, in_view, kernels_for, project_map, render, require_finite
+from .api import NEAR, Backend, choose_backend, depth_ratio, in_view, kernels_for, project_map, render, require_finite
 from .gaussian_map import DECIDED_LOGIT, GaussianMap, decided_channels
 
 
@@ -21,7 +21,7 @@ class BlendingWeights:
 
 
 @dataclass(frozen=True)
-class Look:
+class Rendered:
     """colors (H, W, 3); depth and silhouette (H, W) as of a `Rendering`; median (H, W) as of `median_depth`; channels
     (H, W) int16: the class for which most is said, each Gaussian speaking for the strongest of its own as far as it is
     seen, -1 where nothing decides."""
@@ -40,7 +40,7 @@ def median_depth(
     cam_from_world: Tensor,
     intrinsics: Intrinsics,
     near: float = NEAR,
-    backend: str | None = None,
+    backend: Backend = None,
 ) -> Tensor:
     """(H, W) depth of the Gaussian at which half the light is lost, 0 where it never is: one surface, never a mean of
     two. No gradients; arguments as in `render`."""
@@ -48,7 +48,9 @@ def median_depth(
 
 
 @torch.no_grad()
-def look(gaussian_map: GaussianMap, cam_from_world: Tensor, intrinsics: Intrinsics, backend: str | None = None) -> Look:
+def render_all(
+    gaussian_map: GaussianMap, cam_from_world: Tensor, intrinsics: Intrinsics, backend: Backend = None
+) -> Rendered:
     """What a camera at (4, 4) sees of a map, by one walk over it on the CPU. No gradients."""
     m, size = gaussian_map, (intrinsics.width, intrinsics.height)
     classes = m.class_logits.shape[1]
@@ -57,16 +59,16 @@ def look(gaussian_map: GaussianMap, cam_from_world: Tensor, intrinsics: Intrinsi
         projected = project_map(m.means, m.radii, cam_from_world, intrinsics)
         features = torch.cat([m.colors, *_strongest(m.class_logits)], dim=1)
         require_finite("features", features)
-        found = module.look(*projected, m.opacities, features, classes, *size, NEAR)
+        found = module.render_all(*projected, m.opacities, features, classes, *size, NEAR)
         colors, depth_sum, silhouette, median, strength, channel = found
         channels = torch.where(strength > DECIDED_LOGIT, channel, -1) if classes else torch.full_like(channel, -1)
-        return Look(colors, depth_ratio(depth_sum, silhouette), median, silhouette, channels.to(torch.int16))
+        return Rendered(colors, depth_ratio(depth_sum, silhouette), median, silhouette, channels.to(torch.int16))
     strength, channel = _strongest(m.class_logits)
     own = torch.zeros_like(m.class_logits).scatter_(1, channel.long(), strength) if classes else m.class_logits
-    seen, beside = (m.means, m.radii, m.opacities), (cam_from_world, intrinsics)
-    drawn = render(*seen, torch.cat([m.colors, own], dim=1), *beside, backend=backend)
-    channels, median = decided_channels(drawn.features[..., 3:]), median_depth(*seen, *beside, backend=backend)
-    return Look(drawn.features[..., :3], drawn.depth, median, drawn.silhouette, channels.to(torch.int16))
+    seen, camera = (m.means, m.radii, m.opacities), (cam_from_world, intrinsics)
+    drawn = render(*seen, torch.cat([m.colors, own], dim=1), *camera, backend=backend)
+    channels, median = decided_channels(drawn.features[..., 3:]), median_depth(*seen, *camera, backend=backend)
+    return Rendered(drawn.features[..., :3], drawn.depth, median, drawn.silhouette, channels.to(torch.int16))
 
 
 def _strongest(logits: Tensor) -> tuple[Tensor, Tensor]:
@@ -84,7 +86,7 @@ def blending_weights(
     cam_from_world: Tensor,
     intrinsics: Intrinsics,
     near: float = NEAR,
-    backend: str | None = None,
+    backend: Backend = None,
     counts: Tensor | None = None,
 ) -> BlendingWeights:
     """What each of the M Gaussians contributes to the image of a camera: 0 where it is not seen at all. No gradients;
@@ -101,7 +103,7 @@ def class_weights(
     channels: Tensor,
     counts: Tensor,
     classes: int,
-    backend: str | None = None,
+    backend: Backend = None,
 ) -> tuple[Tensor, Tensor]:
     """Rows (R,) of the Gaussians in view, and (R, classes) what each contributes to the pixels of each class: channels
     (H, W) uint8, other numbers are no class; counts (H, W). No gradients; the others as in `render`."""
@@ -122,12 +124,12 @@ def class_weights(
     return torch.arange(len(means), device=means.device), found
 
 
-def _compiled(backend: str | None, example: Tensor) -> ModuleType | None:
+def _compiled(backend: Backend, example: Tensor) -> ModuleType | None:
     """The compiled CPU backend, where tensors like `example` take it."""
     if kernels_for(backend, example) is not None:
         return None
     module = choose_backend(backend, example)
-    return module if module.__name__.endswith(".cpu") else None
+    return module if hasattr(module, "render_all") else None
 
 
 def _inspect(
@@ -137,7 +139,7 @@ def _inspect(
     cam_from_world: Tensor,
     intrinsics: Intrinsics,
     near: float,
-    backend: str | None,
+    backend: Backend,
     counts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     if (kernels := kernels_for(backend, means)) is not None:

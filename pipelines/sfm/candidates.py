@@ -106,8 +106,7 @@ def _better(
 class CandidateModels:
     """Inputs of candidate models besides the keyframes: `camera` is the prior, `is_fixed` holds it, `is_stated` holds
     it unless the images contradict it; `asks_pairs`: the focal length that pairs tell, not COLMAP's guess, is where
-    calibration starts. `is_extension`: the given poses are those of a finished run that images were
-    added to, and are tried first. `frame_interval`: seconds from one image of the source to the next, 0 where its times
+    calibration starts. `frame_interval`: seconds from one image of the source to the next, 0 where its times
     are unknown; no readout is longer. cam_from_rig (C, 3, 3): keyframes are ordered direction by direction, as in
     `Rig`."""
 
@@ -119,7 +118,6 @@ class CandidateModels:
     seed: int
     is_stated: bool = False
     asks_pairs: bool = True
-    is_extension: bool = False
     frame_interval: float = 0.0
     cam_from_rig: NDArray[np.float64] = field(default_factory=lambda: ONE_CAMERA.cam_from_rig)
 
@@ -156,7 +154,7 @@ class CandidateModels:
     def _adjusted(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> AdjustedModel | None:
         """Return the best adjusted model, with the readout of a rolling shutter that is given or found."""
         mappers = ("global", "incremental")
-        found = self._map(views, pairs, (GIVEN, *mappers) if self.is_extension else (*mappers, GIVEN))
+        found = self._map(views, pairs, (*mappers, GIVEN))
         if found is None:
             return None
         model, mapper, report = found

@@ -13,7 +13,6 @@ from ..types import Calibration, Intrinsics
 
 _BORDER_POINTS = 65
 _TURN_STEPS = 501
-_FOCAL_ROUNDS = 6
 FOCAL_GUESS = 1.2
 """Focal length in longer sides of the image where it is unknown."""
 _MIN_SHIFT_PX = 0.3
@@ -44,17 +43,6 @@ def unknown_camera(width: int, height: int, focal: float, is_prior: bool) -> pyc
     made = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, width, height)
     made.has_prior_focal_length = is_prior
     return made
-
-
-def calibrated_camera(known: Calibration) -> pycolmap.Camera:
-    """Return the distorted camera that a calibration is of, with the same radial coefficients, to be calibrated on."""
-    pinhole = known.intrinsics
-    camera = unknown_camera(pinhole.width, pinhole.height, pinhole.fx, is_prior=True)
-    set_lens(camera, 2 if known.distortion[1] else 1)
-    for _ in range(_FOCAL_ROUNDS):  # the pinhole of a lens is enlarged by as much as the lens and this make necessary
-        focal = camera.params[0] * pinhole.fx / make_lens(camera).pinhole.fx
-        camera.params = [focal, pinhole.cx, pinhole.cy, *known.distortion[: len(camera.params) - 3]]
-    return camera
 
 
 def set_lens(camera: pycolmap.Camera, coefficients: int) -> None:

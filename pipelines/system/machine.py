@@ -2,6 +2,7 @@
 
 import ctypes
 import functools
+import importlib.metadata
 import math
 import os
 import shutil
@@ -38,6 +39,9 @@ MIN_SUBMAP = 60
 ALIGNED_TOGETHER = 200
 """Fields of depths that are solved for at once: their equations take 0.4 MB each."""
 _UNKNOWN_MACHINE = 8_000_000_000
+"""Bytes."""
+LEAST_CAPABILITY = (8, 0)
+"""Compute capability of the cards that the kernels run on."""
 
 
 def submap_size(config: Config, camera: Intrinsics) -> int:
@@ -148,17 +152,36 @@ def windows_of(count: int, size: int = WINDOW, shared: int = WINDOW_OVERLAP) -> 
 
 
 def resolve_device(wanted: str = "auto") -> str:
-    """ "cpu" or "cuda": `auto` takes a GPU if there is one. Raises InputError for a GPU that is not there."""
-    import torch
-
-    found = torch.cuda.is_available()
-    if wanted == "cuda" and not found:
-        raise InputError(
-            "--device cuda: torch finds no CUDA device here. Use --device cpu, or install a CUDA build of torch"
-        )
+    """ "cpu" or "cuda": `auto` takes a GPU that the kernels run on, if there is one. Raises InputError where one is
+    asked for and there is none."""
+    fault = card_fault()
+    if wanted == "cuda" and fault:
+        raise InputError(f"--device cuda: {fault}. Use --device cpu, or install a CUDA build of torch")
     if wanted != "auto":
         return wanted
-    return _log_once("cuda" if found else "cpu")
+    return _log_once("cpu" if fault else "cuda")
+
+
+def card_fault() -> str:
+    """Say why no card can be used; "" where one can: older ones have too little shared memory for the kernels."""
+    import torch
+
+    if not torch.cuda.is_available():
+        return "torch finds no CUDA device here"
+    if (capability := torch.cuda.get_device_capability()) < LEAST_CAPABILITY:
+        return f"the card has compute capability {capability[0]}.{capability[1]}, and 8.0 is needed"
+    return "" if has_triton() else "there is no triton >= 3.3, which comes with torch >= 2.7 built for CUDA"
+
+
+@functools.cache
+def has_triton() -> bool:
+    """Whether a Triton is there that compiles the kernels."""
+    try:
+        version = importlib.metadata.version("triton")
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    # 3.2 does not refuse the kernels but ends the process while compiling them.
+    return tuple(int(part) for part in version.split(".")[:2]) >= (3, 3)
 
 
 def require_device(wanted: str) -> None:
@@ -168,12 +191,16 @@ def require_device(wanted: str) -> None:
 
 
 def unused_card() -> tuple[str, str] | None:
-    """An NVIDIA driver whose card torch does not find, and what to install; None where there is none, or where
+    """What is wrong with an NVIDIA card that is not used, and what to do; None where there is none, or where
     CUDA_VISIBLE_DEVICES hides it."""
     import torch
 
+    if torch.cuda.is_available():
+        return (
+            (f"{fault}: everything runs on the CPU", "use a newer card or torch") if (fault := card_fault()) else None
+        )
     has_driver = shutil.which("nvidia-smi") or Path("/dev/nvidia0").exists()
-    if torch.cuda.is_available() or not has_driver or os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1"):
+    if not has_driver or os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1"):
         return None
     if torch.version.cuda is None:
         command = install_command("--force-reinstall", "torch<2.14")

@@ -32,7 +32,7 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import pixel_centers, project
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth, neighbours
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.global_ba.candidates import loop_candidates, summarise_labels
+from msgs_slam.pipelines.global_ba.loops import loop_candidates
 from msgs_slam.pipelines.sfm.bundle import adjust_bundle
 from msgs_slam.pipelines.sfm.features import GlobalDescriptors, far_apart, loop_pairs, unit
 from msgs_slam.pipelines.tracking.adjust import make_bundle
@@ -88,16 +88,6 @@ class Synthetic:
         walk = np.cumsum(steps, 0)
         return np.tile(unit(walk[20:] - walk[:-20]), 8).astype(np.float32) / np.float32(8**0.5)
 
-    @cached_property
-    def summaries(self) -> list[Any]:
-        rng = np.random.default_rng(2)
-        out = []
-        for _ in range(self.count):
-            rows = np.sort(rng.integers(0, 60, 5))
-            labels = np.searchsorted(rows, np.arange(60))[:, None] + np.zeros((1, 80), np.int64)
-            out.append(summarise_labels(((labels + rng.integers(0, 3)) % 8).astype(np.uint8), 8))
-        return out
-
 
 def _depth_of(cam_from_world: NDArray[np.float64]) -> NDArray[np.float32]:
     """(H, W) distance along z to the walls, floor, ceiling and the end wall of the module around a camera."""
@@ -131,7 +121,7 @@ def _loops_by_look(s: Synthetic) -> None:
 
 
 def _loop_candidates(s: Synthetic) -> None:
-    loop_candidates(s.model, GlobalDescriptors((s.looks,)), s.summaries, ())
+    loop_candidates(s.model, GlobalDescriptors((s.looks,)), ())
 
 
 def _bundle(s: Synthetic) -> None:
@@ -156,7 +146,7 @@ CASES: dict[str, tuple[str, Callable[[Synthetic], Any]]] = {
     "depth fields, tracking": ("views", _fields),
     "stereo: views to match, of 60 keyframes": ("model", _stereo),
     "loops by look, frames": ("looks", _loops_by_look),
-    "loops by look and labels, global_ba": ("looks model summaries", _loop_candidates),
+    "loops by look, global_ba": ("looks model", _loop_candidates),
     "the segment of a point, a frame each": ("model", _segments),
     "bundle adjustment, two steps": ("model", _bundle),
 }

@@ -198,7 +198,7 @@ def optimiser() -> MapOptimiser:
     state = OptimiserState.fresh(views, CLASSES, made_map(generator), None)
     out = MapOptimiser(views, CLASSES, MappingConfig(), state)
     for _ in range(2):
-        out.visit(step(1))
+        out.step(step(1))
     return out
 
 
@@ -222,11 +222,11 @@ def measure() -> dict[str, Counting]:
         as_on_a_card(patch)
         mapper = optimiser()
         mapper.state.settle_poses()
-        rows = {"a visit": counted(lambda: mapper.visit(step(1)))}
-        mapper.visit(step(2))
+        rows = {"a visit": counted(lambda: mapper.step(step(1)))}
+        mapper.step(step(2))
         return rows | {
             "poses, once a pass": counted(mapper.state.settle_poses),
-            "a visit that notes weights and errors": counted(lambda: mapper.visit(step(1, note=True))),
+            "a visit that notes weights and errors": counted(lambda: mapper.step(step(1, note=True))),
             f"classes counted, {VIEWS} views": counted(mapper.count_labels),
             "stereo of a keyframe": counted(stereo_of_a_keyframe),
         }

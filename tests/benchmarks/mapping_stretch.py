@@ -34,9 +34,8 @@ from msgs_slam.pipelines.depth.fields import FINE, field_scales
 from msgs_slam.pipelines.evaluation.image_quality import DepthErrorSum, psnr, ssim
 from msgs_slam.pipelines.evaluation.labels import count_labels, score
 from msgs_slam.pipelines.evaluation.views import view_map
-from msgs_slam.pipelines.mapping.load import without_contradicted_depth
 from msgs_slam.pipelines.mapping.optimise import optimise_map
-from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes
+from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes, without_contradicted_depth
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.system.parallel import LruSequence
 from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps

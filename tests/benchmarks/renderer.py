@@ -28,6 +28,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests/pipelines/render")]
 
+import reference
 import torch
 from render_scenes import room
 from torch import Tensor
@@ -39,6 +40,7 @@ from msgs_slam.pipelines.mapping.losses import photo_loss
 from msgs_slam.pipelines.render.api import Rendering, choose_backend, composite, project_map, render
 
 ROWS = [(320, 240, 50_000, 8), (320, 240, 200_000, 8), (640, 480, 200_000, 8), (640, 480, 200_000, 40)]
+BACKENDS = {"reference": reference}
 WANTED = [8.2, 8.8, 12.3, 7.9]
 """How many times faster than the reference forward + backward should be: 0.72 of a C++/OpenMP program's lead."""
 
@@ -74,19 +76,19 @@ class Case:
 
     @torch.no_grad()
     def forward(self, backend: str) -> None:
-        composite(*self.inputs[:-1], self.features, *self.size, backend=backend)
+        composite(*self.inputs[:-1], self.features, *self.size, backend=BACKENDS.get(backend, backend))
 
     def forward_backward(self, backend: str) -> None:
         for tensor in self.inputs:
             tensor.grad = None
-        image = composite(*self.inputs, *self.size, backend=backend)
+        image = composite(*self.inputs, *self.size, backend=BACKENDS.get(backend, backend))
         images = (image.features, image.depth_sum, image.depth_silhouette, image.silhouette)
         torch.autograd.backward(images, self.upstream)
 
     def forward_backward_of_all(self, backend: str) -> None:
         """Colours and classes, as a mapping needs it that learns the classes."""
         features = self.features.clone().requires_grad_()
-        image = composite(*self.inputs[:-1], features, *self.size, backend=backend)
+        image = composite(*self.inputs[:-1], features, *self.size, backend=BACKENDS.get(backend, backend))
         torch.autograd.backward((image.features, image.depth_sum), (torch.ones_like(image.features), self.upstream[1]))
 
     def gsplat(self) -> Callable[[], None] | None:

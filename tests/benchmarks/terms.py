@@ -21,9 +21,9 @@ import numpy as np
 
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.mapping import schedule
-from msgs_slam.pipelines.mapping.load import MappingInput, load_views
 from msgs_slam.pipelines.mapping.measure import mean_figures, measure_view
 from msgs_slam.pipelines.mapping.optimise import optimise_map
+from msgs_slam.pipelines.mapping.views import MappingInput, load_views
 from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 

@@ -38,13 +38,12 @@ from msgs_slam.pipelines.geometry.posed_depth import PosedDepth, neighbours, ove
 from msgs_slam.pipelines.geometry.room_layout import Gravity, find_gravity, floor_plane, levels, name_structure
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.geometry.voxels import Voxels, find_near, gather_depths, touching, voxel_keys
-from msgs_slam.pipelines.mapping.exposure import fit_exposure
-from msgs_slam.pipelines.mapping.losses import depth_loss
-from msgs_slam.pipelines.mapping.measure import depth_view, drawn_view
+from msgs_slam.pipelines.mapping.growth import complete_depth, fill_smoothly, seed_spacing
+from msgs_slam.pipelines.mapping.losses import depth_loss, fit_exposure
+from msgs_slam.pipelines.mapping.measure import depth_view, mesh_view
 from msgs_slam.pipelines.mapping.optimise import voted_logits
-from msgs_slam.pipelines.mapping.seeding import complete_depth, fill_smoothly, seed_spacing
 from msgs_slam.pipelines.mapping.submaps import nearest_seeing
-from msgs_slam.pipelines.mapping.views import halved, make_view, occurring_classes
+from msgs_slam.pipelines.mapping.views import half_view, make_view, occurring_classes
 from msgs_slam.pipelines.paper.mapping import with_region_prior
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.scene.gps import georeference
@@ -177,7 +176,7 @@ def few_pixels() -> Iterator[Any]:
             yield lambda d=depth, p=photo: seed_spacing(p, d, 2, 0.5, 0.5)
             yield lambda d=depth, p=photo: with_region_prior(d, np.zeros_like(d), p[..., 0], 0.1)
         for given in (maps(size, 0, 0), maps(size, np.nan, 1), maps(size, 2, 1), None):
-            yield lambda g=given, k=k, p=photo: halved(make_view(0, k, EYE, p, g, ()))
+            yield lambda g=given, k=k, p=photo: half_view(make_view(0, k, EYE, p, g, ()))
             if given is not None:
                 yield lambda g=given: resize_maps(g, 1, 1)
                 yield lambda g=given, k=k: scale_at_points(g, np.empty((0, 2)), NONE, k, 0)
@@ -202,7 +201,7 @@ def few_others() -> Iterator[Any]:
     for count in (0, 1):
         z = torch.zeros
         few = GaussianMap(z(count, 3) - 1, z(count), z(count), z(count, 3), z(count, 2), z(count, dtype=torch.int64))
-        yield lambda m=few: (depth_view(m, EYE, camera(1, 1)), drawn_view(m, EYE, camera(12, 16)), voted_logits(m, []))
+        yield lambda m=few: (depth_view(m, EYE, camera(1, 1)), mesh_view(m, EYE, camera(12, 16)), voted_logits(m, []))
         yield lambda m=few: view_map(m, np.zeros(3, np.uint8), camera(12, 16), EYE)
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compute.lanes import any_of, exp, iota, load, maximum, min_scalar, splat, store, where
+from ...compute.lanes import any_lane, exp, iota, load, maximum, min_scalar, splat, store, where
 from ...compute.threads import fused_kernel, inner
 from ...geometry.camera import project
 from ...geometry.sparse_model import SparseModel
@@ -81,7 +81,7 @@ def _fuse_band(
         rows[0, :width] = depth[y]
         for x in range(0, width, _LANES):
             z = load(rows[0], x)
-            if not any_of(z > _ZERO):
+            if not any_lane(z > _ZERO):
                 for k in range(1, 4):
                     store(rows[k], x, splat(_ZERO))
                 continue
@@ -95,7 +95,7 @@ def _fuse_band(
                 ou = (z * (u * w[0, 0] + (w[0, 1] * v + w[0, 2])) + w[0, 3]) * scale
                 ov = (z * (u * w[1, 0] + (w[1, 1] * v + w[1, 2])) + w[1, 3]) * scale
                 shown = shown & (ou >= _ZERO) & (ov >= _ZERO) & (ou < np.float32(width)) & (ov < np.float32(height))
-                if not any_of(shown):
+                if not any_lane(shown):
                     continue
                 # Elsewhere the place may be anything, and what is read there does not count.
                 ou, ov = where(shown, ou), where(shown, ov)

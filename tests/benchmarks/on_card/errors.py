@@ -3,25 +3,26 @@
 from typing import Any
 
 import numpy as np
+import reference
 import torch
 from render_scenes import IMAGES, NAMES, room
 from torch import Tensor
 
 import msgs_slam.pipelines.depth.stereo.matching as matching
-from msgs_slam.pipelines.compute.adam import descend_by_kernel, plain_descend
+from msgs_slam.pipelines.compute.adam import descend
 from msgs_slam.pipelines.depth.stereo import card
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.depth.stereo.sweep import refine_inverse_depth, sweep_cost
 from msgs_slam.pipelines.depth.stereo.volume import Bands, smooth_cost
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure
+from msgs_slam.pipelines.mapping.losses import expose, fit_exposure
 from msgs_slam.pipelines.mapping.objective import Objective, color_errors_on_card, fit_exposure_on_card
 from msgs_slam.pipelines.mapping.state import KEYS
-from msgs_slam.pipelines.render import reference
 from msgs_slam.pipelines.render.api import Rendering, composite, in_view, project_map, render
 from on_card.rows import Rows
 from on_card.scenes import CARD, CPU, SIZES, StereoScene, mapper, step, stereo_scene, there, world_of
 from tests.dense_volumes import of_dense, to_dense
+from tests.plain_adam import plain_descend
 
 POSE = se3.exp(torch.tensor([0.03, -0.02, 0.04, 0.01, -0.02, 0.005], dtype=torch.float64))
 RELATIVE, FAR, SHARE = 1e-3, 1e-3, 0.02
@@ -67,7 +68,7 @@ def _projected(row: tuple[int, int, int, int], classes: int) -> list[Tensor]:
 
 def _compositing(rows: Rows, row: tuple[int, int, int, int], classes: int) -> None:
     given, found = _projected(row, classes), []
-    for backend, device, kind in (("cuda", CARD.device, torch.float32), ("reference", "cpu", torch.float64)):
+    for backend, device, kind in (("cuda", CARD.device, torch.float32), (reference, "cpu", torch.float64)):
         leaves = [x.to(device, kind, copy=True).requires_grad_() for x in given]
         image = composite(*leaves, *row[:2], backend=backend)
         images = [getattr(image, name) for name in IMAGES]
@@ -84,7 +85,7 @@ def _pulls(images: list[Tensor]) -> list[Tensor]:
 
 def _rendering(rows: Rows, row: tuple[int, int, int, int]) -> None:
     found = []
-    for backend, place, kind in (("cuda", CARD, torch.float32), ("reference", CPU, torch.float64)):
+    for backend, place, kind in (("cuda", CARD, torch.float32), (reference, CPU, torch.float64)):
         world, k = world_of(row, place, kind)
         leaves = [*world, POSE.to(place.device, kind, copy=True).requires_grad_()]
         with place.used():
@@ -138,7 +139,7 @@ def _adam(rows: Rows) -> None:
     ours = [x.to(CARD.device, copy=True) for x in start]
     places = (x.to(CARD.device) for x in (gradient, shares, chosen))
     g, s, r = places
-    descend_by_kernel(ours[0], g, ours[1], ours[2], 0.1, 6, s, r)
+    descend(ours[0], g, ours[1], ours[2], 0.1, 6, s, r)
     parts = [x[chosen].double() for x in start]
     plain_descend(parts[0], gradient.double(), parts[1], parts[2], 0.1, 6, shares.double())
     for of, mine, exact in zip(("values", "first moments", "second moments"), ours, parts, strict=True):
@@ -183,7 +184,7 @@ def _visits(rows: Rows) -> None:
             state = optimiser.state
             before = {k: state.parameters[k].detach().cpu().clone() for k in KEYS}
             for i in range(SIZES.views):
-                optimiser.visit(step(i, note=True))
+                optimiser.step(step(i, note=True))
             moved = {k: state.parameters[k].detach().cpu() - before[k] for k in KEYS}
             rest = dict(zip(("weights", "errors"), state.parameters.noted.unbind(1), strict=True))
             optimiser.count_labels()

@@ -102,7 +102,7 @@ def mapper(place: Place) -> MapOptimiser:
     state = OptimiserState.fresh(views, CLASSES, given, None)
     optimiser = MapOptimiser(views, CLASSES, MappingConfig(), state)
     for i in range(SIZES.views):
-        optimiser.visit(step(i))
+        optimiser.step(step(i))
     return optimiser
 
 

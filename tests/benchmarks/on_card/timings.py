@@ -59,8 +59,8 @@ def time_mapping(rows: Rows) -> None:
         with rows.attempt(f"mapping on {place.name}"), place.used():
             optimiser = mapper(place)
             tasks: dict[str, Callable[[], object]] = {
-                "a visit": lambda o=optimiser: o.visit(step(1)),
-                "a visit that notes weights and errors": lambda o=optimiser: o.visit(step(1, note=True)),
+                "a visit": lambda o=optimiser: o.step(step(1)),
+                "a visit that notes weights and errors": lambda o=optimiser: o.step(step(1, note=True)),
                 f"classes counted, {SIZES.views} views": optimiser.count_labels,
             }
             for of, task in tasks.items():

@@ -13,7 +13,7 @@ from msgs_slam.pipelines.depth.align import COARSE, align_keyframes, fit_fields
 from msgs_slam.pipelines.depth.fields import FINE, DepthFields, Equations, contradicted, field_scales, solve_fields
 from msgs_slam.pipelines.geometry.posed_depth import CANDIDATES, PosedDepth, overlaps
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.mapping.load import MappingInput
+from msgs_slam.pipelines.mapping.views import MappingInput
 from msgs_slam.pipelines.run.files import CALIBRATION, DEPTH_FIELDS, PROXY_MAPS, SPARSE
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps

@@ -17,18 +17,18 @@ from msgs_slam.pipelines.export.mesh import paint
 from msgs_slam.pipelines.export.surface import Region, Surface, Triangles, chunk_surfaces, closed, joined, weld
 from msgs_slam.pipelines.export.volume import CHUNK, Grid, Volume, fuse, make_grid
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
-from msgs_slam.pipelines.mapping.measure import DrawnView
+from msgs_slam.pipelines.mapping.measure import MeshView
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import VOID
 
 VOXEL = 0.02
 
 
-def painted(view: PosedDepth) -> DrawnView:
+def painted(view: PosedDepth) -> MeshView:
     """Where x < 0 in the world channel 0 and red, else channel 1 and blue."""
     left = seen_points(view)[..., 0] < 0
     colors = np.where(left[..., None], [204, 0, 0], [0, 0, 204]).astype(np.uint8)
-    return DrawnView(view, colors, np.where(left, 0, 1).astype(np.int16))
+    return MeshView(view, colors, np.where(left, 0, 1).astype(np.int16))
 
 
 class Corridor(Sequence[PosedDepth]):

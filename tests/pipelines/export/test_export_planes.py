@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import ExportConfig
-from msgs_slam.pipelines.export.mesh import draw, drawn_views, keyframe_rows, planes_in, snap
+from msgs_slam.pipelines.export.mesh import draw, keyframe_rows, mesh_views, planes_in, snap
 from msgs_slam.pipelines.export.planes import Planes, find_planes, planes_of, snap_to_planes
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.geometry.voxels import Voxels
-from msgs_slam.pipelines.mapping.measure import DrawnView
+from msgs_slam.pipelines.mapping.measure import MeshView
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.progress import SilentProgress
@@ -36,15 +36,15 @@ def room() -> Image:
     return np.minimum(WALL, FLOOR / np.maximum(RAYS[..., 1], 1e-9))
 
 
-def view(depth: Image, unsure: NDArray[np.bool_], aside: float) -> DrawnView:
+def view(depth: Image, unsure: NDArray[np.bool_], aside: float) -> MeshView:
     """From a camera `aside` to the right; what is seen moves with it."""
     pose = np.eye(4)
     pose[0, 3] = -aside
     shown = PosedDepth(CAMERA, pose, depth.astype(np.float32), np.ones(depth.shape, np.float32))
-    return DrawnView(shown, np.zeros((*depth.shape, 3), np.uint8), None, unsure)
+    return MeshView(shown, np.zeros((*depth.shape, 3), np.uint8), None, unsure)
 
 
-def views(depth: Image, unsure: NDArray[np.bool_]) -> list[DrawnView]:
+def views(depth: Image, unsure: NDArray[np.bool_]) -> list[MeshView]:
     return [view(depth, unsure, aside) for aside in (-0.1, 0.0, 0.1)]
 
 
@@ -127,12 +127,12 @@ def test_views_of_a_run_are_made_straight_once(oracle_run: OracleRun, tmp_path: 
     outcome = load_outcome(run)
     count = len(keyframe_rows(outcome))
     draw(outcome, ExportConfig(mesh_side=80, planes=False), tmp_path / "off", SilentProgress(), range(count))
-    assert drawn_views(tmp_path / "off", count)[0].unsure is None
+    assert mesh_views(tmp_path / "off", count)[0].unsure is None
     draw(outcome, ExportConfig(mesh_side=80), tmp_path, SilentProgress(), range(count))
-    assert drawn_views(tmp_path, count)[0].unsure is not None
+    assert mesh_views(tmp_path, count)[0].unsure is not None
     planes = planes_in(tmp_path, count)
     snap(tmp_path, planes, SilentProgress(), range(count))
     done = {path: path.read_bytes() for path in tmp_path.glob("*.npz")}
-    assert all(v.unsure is None for v in drawn_views(tmp_path, count))
+    assert all(v.unsure is None for v in mesh_views(tmp_path, count))
     snap(tmp_path, planes_in(tmp_path, count), SilentProgress(), range(count))
     assert done == {path: path.read_bytes() for path in tmp_path.glob("*.npz")}

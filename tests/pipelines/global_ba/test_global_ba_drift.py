@@ -107,8 +107,8 @@ def close(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Callable[[str], tuple[RunFolder, dict]]:
     """close(joint): a run whose loop is closed, and the stage's figures."""
-    monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.MIN_ALIKE", -1.0)
-    monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.GAP", 2)
+    monkeypatch.setattr("msgs_slam.pipelines.global_ba.loops.MIN_ALIKE", -1.0)
+    monkeypatch.setattr("msgs_slam.pipelines.global_ba.loops.GAP", 2)
 
     def run(joint: str) -> tuple[RunFolder, dict]:
         made = make_run(tmp_path / joint, keyframes=tuple(range(0, 24, 2)), backbone_scale=1.0, metric=False)

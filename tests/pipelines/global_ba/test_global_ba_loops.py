@@ -1,4 +1,4 @@
-"""Loops on a made-up walk round a room: found, closed, not believed where they cannot be; likeness of labels, VLAD."""
+"""Loops on a made-up walk round a room: found, closed, not believed where they cannot be; VLAD."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba import loops
-from msgs_slam.pipelines.global_ba.candidates import (
+from msgs_slam.pipelines.global_ba.close import adjust_with_loops, reprojection_error
+from msgs_slam.pipelines.global_ba.loops import (
+    FoundLoops,
+    KeyframeView,
+    find_loops,
     loop_candidates,
-    richness,
+    make_keyframe_view,
     shared_points,
-    similarity,
-    structure_similarity,
-    summarise_labels,
+    verify_loop,
 )
-from msgs_slam.pipelines.global_ba.close import close_loops, reprojection_error
-from msgs_slam.pipelines.global_ba.loops import FoundLoops, KeyframeView, find_loops, make_view, verify_loop
 from msgs_slam.pipelines.sfm.features import GlobalDescriptors, global_descriptor, learn_vocabulary
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.state import TrackState
@@ -45,13 +45,14 @@ class Walk:
         state = TrackState.from_backbone(self.model, 0.5)
         rows = zip(self.model.frame_ids.tolist(), self.model.cam_from_world, self.features, strict=True)
         points = self.model.points_in_world
-        return [make_view(i, p, f, state.sightings[i], points, np.zeros(len(f.xy)), CAMERA) for i, p, f in rows]
+        return [
+            make_keyframe_view(i, p, f, state.sightings[i], points, np.zeros(len(f.xy)), CAMERA) for i, p, f in rows
+        ]
 
     def pairs(self, refused: Collection[tuple[int, int]] = ()) -> list[tuple[int, int]]:
-        nothing = [summarise_labels(np.full((4, 4), 255, np.uint8), 3)] * len(self.features)
         vocabulary = learn_vocabulary(self.features, 0)
         looks = GlobalDescriptors((np.stack([global_descriptor(f, vocabulary) for f in self.features]),))
-        return loop_candidates(self.model, looks, nothing, refused)
+        return loop_candidates(self.model, looks, refused)
 
     def find(self) -> FoundLoops:
         return find_loops(self.pairs(), self.views(), self.model.cam_from_world, CAMERA, 0)
@@ -163,7 +164,7 @@ def test_closing_takes_the_drift_away(drift: float, growth: float) -> None:
     assert len(found.loops) >= 3
     state = TrackState.from_backbone(walk.model, 0.5)
     before = error(walk.model.cam_from_world, walk.truth)
-    closed = close_loops(state, found.loops, drift != 0, CAMERA, lambda _: None, False, TrackingConfig())
+    closed = adjust_with_loops(state, found.loops, drift != 0, CAMERA, lambda _: None, False, TrackingConfig())
     after = error(np.array([state.poses[k] for k in range(40)]), walk.truth)
     assert 0 < after < 0.004
     assert drift == 0 or before > 0.015
@@ -217,40 +218,6 @@ def test_search_is_repeatable() -> None:
     assert [x.edge.frame2_from_frame1.tobytes() for x in first.loops] == [
         x.edge.frame2_from_frame1.tobytes() for x in second.loops
     ]
-
-
-def stripes(count: int) -> np.ndarray:
-    return np.repeat(np.arange(count), 120 // count)[None].repeat(90, 0).astype(np.uint8)
-
-
-def test_more_classes_and_borders_are_richer() -> None:
-    summaries = [summarise_labels(stripes(n), 8) for n in (1, 2, 4, 8)]
-    assert np.argsort(richness(summaries)).tolist() == [0, 1, 2, 3]
-    assert summaries[0].entropy == 0
-    assert summaries[3].entropy == pytest.approx(np.log(8), rel=1e-3)
-    assert summaries[1].boundary < summaries[2].boundary
-
-
-def test_only_the_top_tenth_is_rich() -> None:
-    rng = np.random.default_rng(0)
-    summaries = [
-        summarise_labels(rng.integers(0, rng.integers(1, 9), (90, 120)).astype(np.uint8), 9) for _ in range(40)
-    ]
-    assert 1 <= (richness(summaries) > 0.9).sum() <= 5
-
-
-def test_structure_knows_neighbours() -> None:
-    a = summarise_labels(stripes(4), 4)
-    shuffled = summarise_labels(np.array([0, 2, 1, 3], np.uint8)[stripes(4)], 4)
-    same, other = structure_similarity(a.graph, np.stack([a.graph, shuffled.graph]))
-    assert same == pytest.approx(1)
-    assert other < 1
-    weights = (0.4, 0.3, 0.3)
-    same, other = similarity(a, [a, shuffled], np.array([1.0, 0.0]), weights, 0.0)
-    assert same == pytest.approx(1)
-    assert 0 < other < 0.6
-    # What cannot pass is not compared label by label.
-    assert similarity(a, [a, shuffled], np.array([1.0, 0.0]), weights, 0.7)[1] == 0
 
 
 def test_the_same_place_looks_alike_and_others_by_chance() -> None:

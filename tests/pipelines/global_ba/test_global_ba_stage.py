@@ -120,7 +120,7 @@ def mapped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Callable[[str], MadeRun]:
     """mapped(name): a run whose mapping is done, in which keyframes near each other may make a loop."""
-    monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.GAP", 2)
+    monkeypatch.setattr("msgs_slam.pipelines.global_ba.loops.GAP", 2)
 
     def make(name: str) -> MadeRun:
         made = make_run(tmp_path / name, keyframes=tuple(range(0, 24, 2)), backbone_scale=1.0)
@@ -146,7 +146,7 @@ def error(poses: Array, truth: Array) -> float:
 def test_a_loop_is_closed_and_the_map_goes_along(
     mapped: Callable[[str], MadeRun], open_stage: Callable[..., StageContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("msgs_slam.pipelines.global_ba.candidates.MIN_ALIKE", -1.0)
+    monkeypatch.setattr("msgs_slam.pipelines.global_ba.loops.MIN_ALIKE", -1.0)
     made = mapped("run")
     before = error(made.run.load(TRAJECTORY, "mapping").cam_from_world, made.cam_from_world)
     config = load_config(overrides=["global_ba.joint=never"])

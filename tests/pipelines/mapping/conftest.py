@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from msgs_slam.pipelines.config import MappingConfig
-from msgs_slam.pipelines.mapping.load import MappingInput, load_views
+from msgs_slam.pipelines.mapping.views import MappingInput, load_views
 from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from tests.pipelines.mapping.small_run import make_run

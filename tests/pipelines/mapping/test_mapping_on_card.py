@@ -18,8 +18,7 @@ pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip
 from msgs_slam.pipelines.compute import gpu  # noqa: E402
 from msgs_slam.pipelines.config import MappingConfig  # noqa: E402
 from msgs_slam.pipelines.mapping import losses  # noqa: E402
-from msgs_slam.pipelines.mapping.exposure import expose, fit_exposure  # noqa: E402
-from msgs_slam.pipelines.mapping.load import MappingInput  # noqa: E402
+from msgs_slam.pipelines.mapping.losses import expose, fit_exposure  # noqa: E402
 from msgs_slam.pipelines.mapping.objective import (  # noqa: E402
     Objective,
     color_errors_on_card,
@@ -31,7 +30,7 @@ from msgs_slam.pipelines.mapping.state import (  # noqa: E402
     KEYS,
     OptimiserState,
 )
-from msgs_slam.pipelines.mapping.views import View  # noqa: E402
+from msgs_slam.pipelines.mapping.views import MappingInput, View  # noqa: E402
 from msgs_slam.pipelines.render import cuda  # noqa: E402
 from msgs_slam.pipelines.render.api import Rendering  # noqa: E402
 from msgs_slam.pipelines.types import VOID, Intrinsics  # noqa: E402
@@ -157,7 +156,7 @@ def test_visits_are_those_of_the_cpu(started: Any, monkeypatch: pytest.MonkeyPat
         before = {k: state.parameters[k].detach().cpu().clone() for k in KEYS}
         optimiser = MapOptimiser(own, classes, MappingConfig(), state)
         for i in (0, 1, 2, 1):
-            optimiser.visit(Step(i, 1.3, 0.5, False, note=True, refine_pose=i > 0))
+            optimiser.step(Step(i, 1.3, 0.5, False, note=True, refine_pose=i > 0))
         result = state.result(own, 4)
         moved = {k: state.parameters[k].detach().cpu() - before[k] for k in KEYS}
         optimiser.count_labels()

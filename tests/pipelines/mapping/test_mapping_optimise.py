@@ -15,13 +15,12 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project_gaussians
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.mapping import growth, optimise, schedule
-from msgs_slam.pipelines.mapping.load import MappingInput
+from msgs_slam.pipelines.mapping.growth import SEED_LOGIT
 from msgs_slam.pipelines.mapping.measure import ViewFigures, measure_view
 from msgs_slam.pipelines.mapping.optimise import MapOptimiser, OptimisedMap, optimise_map, voted_logits
 from msgs_slam.pipelines.mapping.schedule import Step
-from msgs_slam.pipelines.mapping.seeding import SEED_LOGIT
 from msgs_slam.pipelines.mapping.state import OptimiserState
-from msgs_slam.pipelines.mapping.views import View
+from msgs_slam.pipelines.mapping.views import MappingInput, View
 from msgs_slam.pipelines.types import VOID
 from tests.killed import KillAt, Killed
 
@@ -91,7 +90,7 @@ def test_splitting_stops_at_the_largest_map(room: MappingInput, monkeypatch: pyt
     state = OptimiserState.fresh(room.views, classes, few.gaussian_map, None)
     optimiser = MapOptimiser(room.views, classes, replace(SETTINGS, max_gaussians=most), state)
     for i in range(len(room.views)):
-        optimiser.visit(Step(i, 1.0, 0.1, False, note=True))
+        optimiser.step(Step(i, 1.0, 0.1, False, note=True))
     optimiser.growth.split()
     assert len(state.parameters) == len(few.gaussian_map) + 30
 
@@ -103,7 +102,7 @@ def test_what_stands_only_where_a_view_shows_no_scene_has_no_weight(room: Mappin
 
     def weights(seen: View) -> torch.Tensor:
         state = OptimiserState.fresh([seen], len(room.class_ids), m, None)
-        MapOptimiser([seen], len(room.class_ids), SETTINGS, state).visit(Step(0, 1.0, 0.1, False, note=True))
+        MapOptimiser([seen], len(room.class_ids), SETTINGS, state).step(Step(0, 1.0, 0.1, False, note=True))
         return state.parameters.noted[:, 0]
 
     in_cam = m.means @ view.cam_from_world[:3, :3].float().T + view.cam_from_world[:3, 3].float()
@@ -139,7 +138,7 @@ def test_views_that_are_looked_at_side_by_side_say_the_same(
         state = OptimiserState.fresh(room.views, len(room.class_ids), mapped.gaussian_map, None)
         optimiser = MapOptimiser(room.views, len(room.class_ids), SETTINGS, state)
         for i in (0, 1):
-            optimiser.visit(Step(i, 1.0, 0.1, False, note=True))
+            optimiser.step(Step(i, 1.0, 0.1, False, note=True))
         optimiser.count_labels()
         return [state.parameters.noted, state.parameters.class_logits]
 
@@ -207,7 +206,7 @@ def test_poses_are_refined_alike_in_every_unit(room: MappingInput, mapped: Optim
         state = OptimiserState.fresh(views, len(room.class_ids), larger, None)
         optimiser = MapOptimiser(views, len(room.class_ids), SETTINGS, state)
         for i in (0, 1, 2) * 3:
-            optimiser.visit(Step(i, 1.0, 1.0, False, refine_pose=True))
+            optimiser.step(Step(i, 1.0, 1.0, False, refine_pose=True))
         return np.stack([t.values["twist"].detach().numpy() for t in state.view_tables]) / ([unit] * 3 + [1.0] * 3)
 
     one, twenty = twists(1.0), twists(20.0)

@@ -6,7 +6,7 @@ import torch
 
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.mapping import growth as densify
-from msgs_slam.pipelines.mapping.seeding import complete_depth, fill_smoothly, seed_gaussians, seed_grid, seed_spacing
+from msgs_slam.pipelines.mapping.growth import complete_depth, fill_smoothly, seed_gaussians, seed_grid, seed_spacing
 from msgs_slam.pipelines.mapping.state import KEYS, MapParameters, empty_map
 from msgs_slam.pipelines.render.gaussian_map import decided_channels
 from msgs_slam.pipelines.types import VOID, Intrinsics

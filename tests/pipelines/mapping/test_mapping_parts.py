@@ -2,7 +2,6 @@
 
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,16 +11,12 @@ import torch
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import resize_depth
-from msgs_slam.pipelines.mapping import extending
 from msgs_slam.pipelines.mapping.division import split_frames
-from msgs_slam.pipelines.mapping.load import MappingInput, load_views
 from msgs_slam.pipelines.mapping.move_map import interpolate_rows, move_trajectory
 from msgs_slam.pipelines.mapping.schedule import RATE_DECAY, Schedule, Seeding, keyframe_weights
-from msgs_slam.pipelines.mapping.views import channel_table, halved, occurring_classes
-from msgs_slam.pipelines.render.gaussian_map import GaussianMap
+from msgs_slam.pipelines.mapping.views import MappingInput, channel_table, half_view, load_views, occurring_classes
 from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, PROXY_MAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Intrinsics, Trajectory
 
 
@@ -73,7 +68,7 @@ def test_views_are_reduced_to_the_working_size(small_run: RunFolder) -> None:
 
 def test_half_a_view_sees_the_same(room: MappingInput) -> None:
     view = room.views[0]
-    half = halved(view)
+    half = half_view(view)
     assert half.depth.shape == (30, 40)
     assert torch.equal(half.channels, view.channels[1::2, 1::2])
     four = torch.stack([view.depth[i::2, j::2] for i in (0, 1) for j in (0, 1)])
@@ -205,33 +200,3 @@ def test_a_view_without_proxy_counts_by_its_colours(small_run: RunFolder) -> Non
     assert (loaded.views[2].channels == VOID).all()
     assert loaded.views[1].depth.max() > 0
     assert replace(loaded.views[1]).frame_id == 1
-
-
-def test_an_extension_that_adds_no_keyframe_leaves_the_map_as_it_was(
-    room: MappingInput, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    ids = np.array([v.frame_id for v in room.views])
-    some = extending._to_visit(room.views, ids != ids[3])
-    assert 3 in some
-    assert len(some) > 1
-    nothing = extending._to_visit(room.views, ids > -1)
-    assert len(nothing) == 0
-    there = GaussianMap(
-        *(torch.zeros(2, *shape) for shape in ((3,), (), (), (3,), (1,))), torch.zeros(2, dtype=torch.int64)
-    )
-    saved = []
-    task = SimpleNamespace(
-        file=lambda kind: tmp_path / kind,
-        before=SimpleNamespace(exposures=lambda: {int(ids[0]): (np.ones(3), np.zeros(3))}),
-        config=SimpleNamespace(mapping=MappingConfig()),
-        save=lambda kind, result: saved.append((kind, result)),
-    )
-    start = ids, np.tile(np.eye(4), (len(ids), 1, 1)), nothing, there
-    monkeypatch.setattr(extending, "_start", lambda *_: start)
-    extending.grow_submap(task, SilentProgress())  # type: ignore[arg-type]
-    [(kind, result)] = saved
-    assert kind == extending.GROWN
-    assert result.gaussian_map is there
-    assert result.steps.sum() == 0
-    np.testing.assert_array_equal(result.frame_ids, ids)
-    np.testing.assert_array_equal(result.log_gains[:2], [[1, 1, 1], [0, 0, 0]])

@@ -13,7 +13,7 @@ from msgs_slam.pipelines.mapping.state import MapParameters
 from msgs_slam.pipelines.render.api import render
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.render.inspection import blending_weights
-from msgs_slam.pipelines.render.notes import Notes
+from msgs_slam.pipelines.render.rules import GaussianStats
 from msgs_slam.pipelines.types import Intrinsics
 
 CAMERA = Intrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0)
@@ -34,38 +34,38 @@ def wall(spacing: float, slope: float = 0.0, radius: float = 0.7) -> GaussianMap
     )
 
 
-def noted(m: GaussianMap, error_of: Callable[[torch.Tensor], torch.Tensor]) -> Notes:
-    notes = Notes()
-    shown = render(m.means, m.radii, m.opacities, m.colors.clone().requires_grad_(), POSE, CAMERA, notes=notes).features
-    notes.errors = error_of(shown.detach())
+def noted(m: GaussianMap, error_of: Callable[[torch.Tensor], torch.Tensor]) -> GaussianStats:
+    stats = GaussianStats()
+    shown = render(m.means, m.radii, m.opacities, m.colors.clone().requires_grad_(), POSE, CAMERA, stats=stats).features
+    stats.errors = error_of(shown.detach())
     shown.sum().backward()
-    return notes
+    return stats
 
 
 def test_a_gaussian_answers_for_errors_by_its_part_in_the_pixel() -> None:
     m = wall(0.2)
     everywhere = noted(m, lambda colors: torch.ones(colors.shape[:2]))
     weights = blending_weights(m.means, m.radii, m.opacities, POSE, CAMERA)
-    assert torch.allclose(everywhere.answered, weights.total, rtol=1e-3, atol=1e-4)
+    assert torch.allclose(everywhere.error_share, weights.total, rtol=1e-3, atol=1e-4)
     assert weights.total.max() > 10
 
     def in_the_left_half(colors: torch.Tensor) -> torch.Tensor:
         return (torch.arange(CAMERA.width) < CAMERA.width // 2).float().expand(colors.shape[:2])
 
-    left = noted(m, in_the_left_half).answered
+    left = noted(m, in_the_left_half).error_share
     assert torch.equal(left[m.means[:, 0] > 0.6], torch.zeros_like(left)[m.means[:, 0] > 0.6])
     inside = m.means[:, 0] < -0.6
-    assert torch.allclose(left[inside], everywhere.answered[inside])
+    assert torch.allclose(left[inside], everywhere.error_share[inside])
 
 
 def test_the_worst_view_counts_where_a_gaussian_is_large_enough() -> None:
     parameters = MapParameters.from_map(wall(1.5))
     growth = Growth([], 0, MappingConfig(), SimpleNamespace(parameters=parameters), 10.0)
     rows, large, small = torch.tensor([0, 2]), torch.tensor([3.0, 3.0]), torch.tensor([3.0, 0.5])
-    for answered, footprints in (([1.0, 5.0], large), ([2.0, 9.0], small)):
-        notes = Notes()
-        notes.largest, notes.answered = torch.tensor([0.5, 0.1]), torch.tensor(answered)
-        growth.note(notes, rows, footprints)
+    for error_share, footprints in (([1.0, 5.0], large), ([2.0, 9.0], small)):
+        stats = GaussianStats()
+        stats.largest, stats.error_share = torch.tensor([0.5, 0.1]), torch.tensor(error_share)
+        growth.note(stats, rows, footprints)
     assert parameters.noted.tolist() == [[0.5, 2.0], [0.0, 0.0], [pytest.approx(0.1), 5.0], [0.0, 0.0]]
     parameters.append(wall(1.5), torch.ones(4), weight=1.0)
     growth.prune(by_weight=True)

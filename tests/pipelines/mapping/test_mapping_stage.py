@@ -5,22 +5,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import plyfile
-import pycolmap
 import pytest
 import torch
 import trimesh
 from finished import note_finished
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.trajectory import read_tum
 from msgs_slam.pipelines.config import Config, ExportConfig, MappingConfig, RunConfig
 from msgs_slam.pipelines.export import stage as export_stage
-from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.export.volume import Grid
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.mapping import stage as mapping_stage
-from msgs_slam.pipelines.mapping.load import load_views
+from msgs_slam.pipelines.mapping.views import load_views
 from msgs_slam.pipelines.run.files import CLASSES, EXPOSURE, MAP, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.stages import StageContext
@@ -67,20 +63,6 @@ def test_mapping_says_how_good_it_is(finished: tuple[RunFolder, dict, dict]) -> 
     assert exposure["log_gains"].shape == (14, 3)
 
 
-def test_colmap_takes_the_model(finished: tuple[RunFolder, dict, dict]) -> None:
-    folder = finished[0].stage("export")
-    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
-    assert model.num_reg_images() == 16
-    assert 0 < model.compute_mean_reprojection_error() < 2
-    assert model.num_points3D() > 100
-    assert all((folder / "images" / image.name).exists() for image in model.images.values())
-    times, poses = read_tum(folder / "trajectory.txt")
-    assert len(times) == 16
-    first = model.images[min(model.images)].cam_from_world().inverse().matrix()
-    turn = WORLD.read(folder / "world.json").image_axes_from_exported  # splats and their data sets have y down
-    assert np.abs(turn @ poses[0][:3] - first).max() < 1e-6
-
-
 def test_workers_leave_the_same_export(
     finished: tuple[RunFolder, dict, dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -100,20 +82,6 @@ def exported_from_run(run: RunFolder) -> Similarity:
     return WORLD.read(run.stage("export") / "world.json").exported_from_run
 
 
-def test_splat_viewers_take_the_map(finished: tuple[RunFolder, dict, dict]) -> None:
-    run = finished[0]
-    vertex = plyfile.PlyData.read(run.stage("export") / "point_cloud.ply")["vertex"]
-    names = [p.name for p in vertex.properties]
-    assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    assert names[9:18] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "class_id"]
-    gaussian_map = run.load(MAP, "mapping").moved(exported_from_run(run))
-    assert len(vertex) == len(gaussian_map)
-    assert np.allclose(vertex["x"], gaussian_map.means[:, 0], atol=1e-6)
-    assert np.allclose(vertex["scale_2"], gaussian_map.log_radii)
-    ids = json.loads((run.stage("mapping") / "mapping.json").read_text())["class_ids"]
-    assert np.array_equal(vertex["class_id"], np.array(ids)[gaussian_map.class_logits.argmax(1)])
-
-
 def test_the_mesh_is_the_room(finished: tuple[RunFolder, dict, dict]) -> None:
     run, _, figures = finished
     mesh = trimesh.load(run.stage("export") / "mesh.ply", process=False)
@@ -130,26 +98,11 @@ def test_the_mesh_is_the_room(finished: tuple[RunFolder, dict, dict]) -> None:
     assert 0 < np.median(distance) < 0.06
 
 
-def test_one_kind_of_file_elsewhere(finished: tuple[RunFolder, dict, dict], tmp_path: Path) -> None:
-    run = finished[0]
-    for kind, name in (("tum", "trajectory.txt"), ("colmap", "sparse"), ("ply", "point_cloud_semantic.ply")):
-        written = export_run(run, tmp_path / kind, kind)
-        assert all(p.exists() for p in written)
-        assert (tmp_path / kind / name).exists()
-        assert not (tmp_path / kind / "mesh.ply").exists()
-    assert (tmp_path / "tum" / "trajectory.txt").read_bytes() == (run.stage("export") / "trajectory.txt").read_bytes()
-
-
 def test_a_finished_mesh_is_not_made_again(finished: tuple[RunFolder, dict, dict]) -> None:
     run, _, figures = finished
     before = (run.stage("export") / "mesh.ply").stat().st_mtime_ns
     assert export_stage.run(context(run, "export")) == figures
     assert (run.stage("export") / "mesh.ply").stat().st_mtime_ns == before
-
-
-def test_a_run_without_a_map_says_what_to_do(small_run: RunFolder, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="msgs-slam resume"):
-        export_run(small_run, tmp_path, "ply")
 
 
 def test_no_keyframe_left_is_refused(small_run: RunFolder, tmp_path: Path) -> None:
@@ -164,7 +117,7 @@ def test_views_on_a_card_are_planned_by_its_own_memory(small_run: RunFolder, mon
     monkeypatch.setattr("torch.cuda.mem_get_info", lambda: (1000, 8_000_000_000))
     assert room_on("cuda", 64e9) == room_on(torch.device("cuda:0"), 64e9) == 1000
     assert room_on("cpu", 64e9) == 64e9
-    monkeypatch.setattr("msgs_slam.pipelines.mapping.load.room_on", lambda device, host: room_on("cuda", host))
+    monkeypatch.setattr("msgs_slam.pipelines.mapping.views.room_on", lambda device, host: room_on("cuda", host))
     views = load_views(small_run, small_run.load(TRAJECTORY, "tracking"), MappingConfig(), memory=64e9).views
     first = views[0]
     assert views[1] is not first

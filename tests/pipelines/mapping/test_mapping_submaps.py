@@ -16,12 +16,10 @@ from msgs_slam.formats.tensors import load_tensors
 from msgs_slam.pipelines.config import Config, MappingConfig, RunConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
-from msgs_slam.pipelines.mapping import exposure as gauge
 from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping import submaps
-from msgs_slam.pipelines.mapping.build import refine_map
-from msgs_slam.pipelines.mapping.exposure import SeenExposures, common_exposure
-from msgs_slam.pipelines.mapping.submaps import BORDER, divide, nearest_seeing
+from msgs_slam.pipelines.mapping.stage import refine_map
+from msgs_slam.pipelines.mapping.submaps import BORDER, SeenExposures, common_exposure, divide, nearest_seeing
 from msgs_slam.pipelines.outcome import load_outcome, maps_around
 from msgs_slam.pipelines.run.files import DEPTH_FIELDS, MAP, SUBMAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -53,8 +51,8 @@ def test_a_walk_is_cut_where_it_shares_least() -> None:
     first, second = divide(np.arange(200) + 1000, overlap.tocsr(), 100)
     assert first.own.tolist() == list(range(1000, 1094))
     assert second.own.tolist() == list(range(1094, 1200))
-    assert first.beside == (1,)
-    assert second.beside == (0,)
+    assert first.neighbours == (1,)
+    assert second.neighbours == (0,)
     assert len(first.border) == BORDER
     assert set(first.border) <= set(second.own)
 
@@ -88,7 +86,7 @@ def test_few_keyframes_are_not_divided() -> None:
         (whole,) = divide(np.arange(40), chain(40, 5), size)
         assert len(whole.own) == 40
         assert len(whole.border) == 0
-        assert whole.beside == ()
+        assert whole.neighbours == ()
 
 
 def test_the_nearest_view_that_sees_a_place_has_it() -> None:
@@ -247,7 +245,7 @@ def test_submaps_are_brought_to_one_exposure(monkeypatch: pytest.MonkeyPatch) ->
     found_gain, found_offset = common_exposure(seen)
     assert found_gain == pytest.approx(own_gain, abs=0.15 * np.abs(own_gain).max())
     assert found_offset == pytest.approx(own_offset, abs=0.3 * np.abs(own_offset).max())
-    monkeypatch.setattr(gauge, "_REST", 1e-6)  # to what is shared alone
+    monkeypatch.setattr(submaps, "_REST", 1e-6)  # to what is shared alone
     found_gain, found_offset = common_exposure(seen)
     assert found_gain == pytest.approx(own_gain, abs=1e-4)
     assert found_offset == pytest.approx(own_offset, abs=1e-4)

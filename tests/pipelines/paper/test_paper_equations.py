@@ -14,12 +14,11 @@ from torch import Tensor
 from msgs_slam.pipelines import paper
 from msgs_slam.pipelines.depth.fields import FINE, field_scales
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.global_ba.candidates import summarise_labels
-from msgs_slam.pipelines.mapping.seeding import seed_gaussians
+from msgs_slam.pipelines.mapping.growth import seed_gaussians
 from msgs_slam.pipelines.mapping.views import View, make_view
-from msgs_slam.pipelines.paper import adjustment, keyframes, loops, mapping, rendering, rerender, tracking, uncertainty
+from msgs_slam.pipelines.paper import adjustment, mapping, rendering, rerender, tracking, uncertainty
 from msgs_slam.pipelines.paper.constants import PAPER
-from msgs_slam.pipelines.paper.gaussians import Gaussians, semantic_image
+from msgs_slam.pipelines.paper.rendering import Gaussians, semantic_image
 from msgs_slam.pipelines.render.api import Rendering
 from msgs_slam.pipelines.types import VOID, Intrinsics, LoopEdge, ProxyMaps
 
@@ -68,30 +67,22 @@ def test_the_table_of_the_method_page_is_that_of_the_code() -> None:
 # (1) to (3) -----------------------------------------------------------------------------------------------------
 
 
-def test_1_proxy_depth_is_what_the_stage_has_stored() -> None:
-    class Run:
-        def find_proxy(self, frame_id: int) -> int:
-            return frame_id
-
-    assert uncertainty.proxy_depth(Run(), 7) == 7  # type: ignore[arg-type]
-
-
 def test_2_reliability_by_hand() -> None:
     flat, half = np.full((6, 6), 2, np.float32), np.full((6, 6), 0.5, np.float32)
-    assert np.allclose(uncertainty.reliability(flat, half), 0.5**0.8)
-    assert np.allclose(uncertainty.reliability(flat, half, theta=0.25), 0.5**0.8 * 0.25**0.5, atol=1e-6)
+    assert np.allclose(uncertainty.depth_reliability(flat, half), 0.5**0.8)
+    assert np.allclose(uncertainty.depth_reliability(flat, half, theta=0.25), 0.5**0.8 * 0.25**0.5, atol=1e-6)
     step = flat.copy()
     step[:, 3:] *= math.exp(0.1)
-    beside = uncertainty.reliability(step, np.ones((6, 6), np.float32))
+    beside = uncertainty.depth_reliability(step, np.ones((6, 6), np.float32))
     assert np.allclose(beside[:, 2], math.exp(-0.7))
     assert np.allclose(beside[:, 0], 1)
-    assert (uncertainty.reliability(np.zeros((6, 6), np.float32), half) == 0).all()
-    assert np.allclose(uncertainty.reliability(1000 * step, half), uncertainty.reliability(step, half))
+    assert (uncertainty.depth_reliability(np.zeros((6, 6), np.float32), half) == 0).all()
+    assert np.allclose(uncertainty.depth_reliability(1000 * step, half), uncertainty.depth_reliability(step, half))
 
 
 def test_3_agreement_is_a_rising_step_around_phi() -> None:
-    assert uncertainty.agreement(PAPER.phi) == 0.5
-    values = [uncertainty.agreement(m) for m in np.linspace(0, 1, 9)]
+    assert uncertainty.semantic_factor(PAPER.phi) == 0.5
+    values = [uncertainty.semantic_factor(m) for m in np.linspace(0, 1, 9)]
     assert values == sorted(values)
     assert values[0] < 0.01
     assert values[-1] > 0.99
@@ -197,7 +188,7 @@ def test_the_renderer_draws_these_equations() -> None:
     means = torch.rand(6, 3, generator=generator) * torch.tensor([0.2, 0.2, 1.0]) + torch.tensor([-0.1, -0.1, 1.5])
     radii, opacities = torch.full((6,), 0.3), torch.rand(6, generator=generator) * 0.8 + 0.1
     features, pose = torch.rand(6, 5, generator=generator), torch.eye(4)
-    shown = rendering.draw(means, radii, opacities, features, pose, CAMERA)
+    shown = rendering.draw_semantics(means, radii, opacities, features, pose, CAMERA)
     xy, radius, depth = rendering.projection(means, radii, pose, CAMERA)
     order = torch.argsort(depth)
     pixel = torch.tensor([20.5, 15.5])
@@ -223,32 +214,32 @@ def test_the_renderer_draws_these_equations() -> None:
 
 def test_10_and_11_overlap_counts_points_in_the_image() -> None:
     points = np.array([[0, 0, 2.0], [0.5, 0, 2], [5, 0, 2], [0, 0, -2]])
-    assert keyframes.overlap(points, np.eye(4), CAMERA) == 0.5
-    assert keyframes.overlap(points[:0], np.eye(4), CAMERA) == 0
-    assert keyframes.geometric_keyframes([0.5, 0.08, 0.081, 0.0]) == [0, 2]
+    assert tracking.overlap(points, np.eye(4), CAMERA) == 0.5
+    assert tracking.overlap(points[:0], np.eye(4), CAMERA) == 0
+    assert tracking.geometric_keyframes([0.5, 0.08, 0.081, 0.0]) == [0, 2]
 
 
 def test_12_keeps_those_that_show_something_else() -> None:
     own = np.zeros((4, 4), np.uint8)
     half = own.copy()
     half[2:] = 1
-    assert keyframes.semantic_keyframes(own, np.stack([own, half, own + 1])).tolist() == [False, True, True]
+    assert tracking.semantic_keyframes(own, np.stack([own, half, own + 1])).tolist() == [False, True, True]
 
 
 def test_13_and_14_older_and_less_reliable_keyframes_weigh_less() -> None:
     ages = np.array([0, 1, 10])
-    assert np.allclose(keyframes.time_weights(ages, np.ones(3)), np.exp(-0.1 * ages))
-    assert np.allclose(keyframes.depth_certainty(np.array([1.0, 0.5, 0.0])), np.exp([0, -0.5, -1]))
+    assert np.allclose(tracking.time_weights(ages, np.ones(3)), np.exp(-0.1 * ages))
+    assert np.allclose(tracking.depth_certainty(np.array([1.0, 0.5, 0.0])), np.exp([0, -0.5, -1]))
 
 
 def test_selection_is_at_most_twenty_drawn_by_weight_and_repeatable() -> None:
     overlaps, differs, weights = [0.5] * 60, np.ones(60, bool), np.r_[np.zeros(30) + 1e-9, np.ones(30)]
-    chosen = keyframes.select(overlaps, differs, weights, np.random.default_rng(1))
+    chosen = tracking.select_keyframes(overlaps, differs, weights, np.random.default_rng(1))
     assert len(set(chosen)) == 20
     assert min(chosen) >= 30
-    assert chosen == keyframes.select(overlaps, differs, weights, np.random.default_rng(1))
-    assert keyframes.select([0.5, 0.0, 0.4], np.zeros(3, bool), np.ones(3), np.random.default_rng(1)) == [0, 2]
-    assert keyframes.select([0.5, 0.5], np.array([False, True]), np.ones(2), np.random.default_rng(1)) == [1]
+    assert chosen == tracking.select_keyframes(overlaps, differs, weights, np.random.default_rng(1))
+    assert tracking.select_keyframes([0.5, 0.0, 0.4], np.zeros(3, bool), np.ones(3), np.random.default_rng(1)) == [0, 2]
+    assert tracking.select_keyframes([0.5, 0.5], np.array([False, True]), np.ones(2), np.random.default_rng(1)) == [1]
 
 
 # (15), (16) -----------------------------------------------------------------------------------------------------
@@ -284,8 +275,8 @@ def test_16_tracking_loss_by_hand() -> None:
 def test_16_finds_a_pose_again() -> None:
     view = a_view(camera=CAMERA.resized(160, 120))
     gaussians, identity = a_map(view), torch.eye(4, dtype=torch.float64)
-    for _ in range(20):  # seeds are not opaque yet
-        mapping.optimise(gaussians, view, identity, 2, 2.0)
+    losses = [mapping.optimise(gaussians, view, identity, 2, 2.0) for _ in range(20)]  # seeds are not opaque yet
+    assert losses[-1] < losses[0]
     start = se3.exp(torch.tensor([0.03, -0.02, 0.02, 0.01, -0.01, 0.01], dtype=torch.float64))
 
     def pixels_off(pose: Tensor) -> float:
@@ -296,20 +287,20 @@ def test_16_finds_a_pose_again() -> None:
             (there - rendering.projection(points, torch.ones(25), identity, view.intrinsics)[0]).norm(dim=1).mean()
         )
 
-    found = tracking.track(gaussians, view, [start], 2, 2.0)
+    found = tracking.track_pose(gaussians, view, [start], 2, 2.0)
     assert 0 < pixels_off(found.cam_from_world) < 0.5
     assert pixels_off(start) > 2
     assert found.covered > 0.9
-    assert (found.cam_from_world == tracking.track(gaussians, view, [start], 2, 2.0).cam_from_world).all()
+    assert (found.cam_from_world == tracking.track_pose(gaussians, view, [start], 2, 2.0).cam_from_world).all()
     nothing = se3.exp(torch.tensor([0, 0, 1.0, 0, 0, 0], dtype=torch.float64))  # all half as far again
     for starts in ([start, identity], [start, nothing], [nothing, start]):
-        assert pixels_off(tracking.track(gaussians, view, starts, 2, 2.0).cam_from_world) < 0.5
+        assert pixels_off(tracking.track_pose(gaussians, view, starts, 2, 2.0).cam_from_world) < 0.5
 
 
 # (17) to (20) ---------------------------------------------------------------------------------------------------
 
 
-def test_region_prior_corrects_unreliable_pixels() -> None:
+def test_17_region_prior_corrects_unreliable_pixels() -> None:
     y, x = np.mgrid[:60, :80]
     truth = (1 / (0.4 + 0.002 * x + 0.001 * y)).astype(np.float32)
     noise = np.random.default_rng(0)
@@ -325,16 +316,8 @@ def test_region_prior_corrects_unreliable_pixels() -> None:
     assert np.abs(corrected / depth - 1)[~weak].max() < 1e-5
     assert (trust[weak] >= 0.35 / 2).all()
     assert np.array_equal(trust[~weak], reliability[~weak])
-
-
-def test_17_unreliable_depth_becomes_that_of_its_region() -> None:
-    depth, u = np.full((40, 40), 2, np.float32), np.ones((40, 40), np.float32)
-    depth[10:20, 10:20], u[10:20, 10:20] = 3, 0.1
-    channels = np.zeros((40, 40), np.uint8)
-    channels[:, 30:] = 1
-    out = mapping.depth_prior(depth, u, channels)
-    assert np.allclose(out[10:20, 10:20], 2, rtol=0.02)
-    assert np.allclose(mapping.depth_prior(depth, np.ones_like(u), channels), depth)  # reliable depth stays
+    assert np.allclose(mapping.depth_prior(depth, reliability, channels), corrected)
+    assert np.allclose(mapping.depth_prior(depth, np.ones_like(reliability), channels), depth), "reliable depth stays"
 
 
 def test_18_map_loss_is_its_weighted_terms() -> None:
@@ -386,7 +369,7 @@ def test_the_three_conditions_of_growth() -> None:
     assert not mapping.needed(same, view).any()
     hole = seen.clone()
     hole[3, 4] = 0.5
-    assert mapping.holes(replace(same, silhouette=hole)).nonzero().tolist() == [[3, 4]]
+    assert mapping.uncovered(replace(same, silhouette=hole)).nonzero().tolist() == [[3, 4]]
     behind = view.depth.clone()
     behind[5, 6] += 0.5  # the map is farther than the proxy
     behind[7, 8] -= 0.5  # and here nearer, which says nothing
@@ -404,11 +387,11 @@ def test_gradients_are_clipped_beside_boundaries_alone() -> None:
     channels = torch.zeros(8, 8, dtype=torch.uint8)
     channels[:, 4:] = 1
     channels[0] = VOID
-    near = mapping.beside_boundary(channels)
+    near = mapping.at_boundary(channels)
     assert near[2].tolist() == [False] * 3 + [True] * 2 + [False] * 3
     image = torch.zeros(8, 8, 2, requires_grad=True)
     shown = image * 1
-    mapping.clip_beside_boundary(shown, channels, 1.0)
+    mapping.clip_at_boundary(shown, channels, 1.0)
     weights = torch.ones(8, 8, 2)
     weights[2, 3] = 100
     weights[2, 0] = 100
@@ -416,15 +399,6 @@ def test_gradients_are_clipped_beside_boundaries_alone() -> None:
     assert image.grad is not None
     assert image.grad[2, 0, 0] == 100
     assert 1 < image.grad[2, 3, 0] < 20
-
-
-def test_mapping_lowers_its_loss() -> None:
-    view, pose = a_view(), torch.eye(4, dtype=torch.float64)
-    gaussians = a_map(view)
-    losses = [mapping.optimise(gaussians, view, pose, 2, 2.0) for _ in range(12)]
-    assert losses[-1] < losses[0]
-    mapping.prune(gaussians, 2.0)
-    assert 0 < len(gaussians) <= 36 * 48
 
 
 # (21) to (26) ---------------------------------------------------------------------------------------------------
@@ -436,33 +410,52 @@ def looks(seed: int, classes: int) -> np.ndarray:
 
 
 def test_21_and_22_the_richest_tenth() -> None:
-    summaries = [summarise_labels(looks(k, 2), 6) for k in range(19)] + [summarise_labels(looks(99, 6), 6)]
-    s = loops.richness(summaries)
+    summaries = [adjustment.summarise_labels(looks(k, 2), 6) for k in range(19)] + [
+        adjustment.summarise_labels(looks(99, 6), 6)
+    ]
+    s = adjustment.richness(summaries)
     assert s.argmax() == 19
     assert ((s > 0) & (s <= 1)).all()
-    assert 19 in loops.semantic_keyframes(summaries)
-    assert len(loops.semantic_keyframes(summaries)) <= 2
-    entropy = loops.richness(summaries, replace(PAPER, theta=1.0))
+    assert 19 in adjustment.rich_keyframes(summaries)
+    assert len(adjustment.rich_keyframes(summaries)) <= 2
+    entropy = adjustment.richness(summaries, replace(PAPER, theta=1.0))
     assert entropy[19] == 1
+
+
+def stripes(count: int) -> np.ndarray:
+    return np.repeat(np.arange(count), 120 // count)[None].repeat(90, 0).astype(np.uint8)
+
+
+def test_22_more_classes_and_borders_are_richer() -> None:
+    summaries = [adjustment.summarise_labels(stripes(n), 8) for n in (1, 2, 4, 8)]
+    assert np.argsort(adjustment.richness(summaries)).tolist() == [0, 1, 2, 3]
+    assert summaries[0].entropy == 0
+    assert summaries[3].entropy == pytest.approx(np.log(8), rel=1e-3)
+    assert summaries[1].boundary < summaries[2].boundary
 
 
 def test_23_proposes_the_place_that_is_seen_again() -> None:
     images = [looks(k, 3) for k in range(20)]
     images[4] = images[19] = looks(77, 6)
-    summaries = [summarise_labels(labels, 6) for labels in images]
+    summaries = [adjustment.summarise_labels(labels, 6) for labels in images]
     vectors = np.random.default_rng(0).normal(size=(20, 16))
     vectors[19] = vectors[4]
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    assert loops.candidates(summaries, vectors) == [(4, 19)]
-    assert loops.candidates(summaries[:8], vectors[:8]) == []  # too near in time
+    assert adjustment.semantic_candidates(summaries, vectors) == [(4, 19)]
+    assert adjustment.semantic_candidates(summaries[:8], vectors[:8]) == []  # too near in time
 
 
 def test_24_weighs_three_likenesses() -> None:
-    one, two = summarise_labels(looks(1, 4), 4), summarise_labels(looks(2, 4), 4)
-    assert loops.similarity(one, [one], np.ones(1))[0] == pytest.approx(1)
+    one, two = adjustment.summarise_labels(looks(1, 4), 4), adjustment.summarise_labels(looks(2, 4), 4)
+    assert adjustment.loop_similarity(one, [one], np.ones(1))[0] == pytest.approx(1)
     alone = replace(PAPER, alpha1=0.0, alpha3=0.0)
-    assert loops.similarity(one, [one, two], np.array([0.5, -0.5]), alone).tolist() == [0.15, -0.15]
-    assert loops.similarity(one, [two], np.ones(1))[0] < 0.95
+    assert adjustment.loop_similarity(one, [one, two], np.array([0.5, -0.5]), alone).tolist() == [0.15, -0.15]
+    assert adjustment.loop_similarity(one, [two], np.ones(1))[0] < 0.95
+    shuffled = np.array([0, 2, 1, 3], np.uint8)[stripes(4)]
+    a, b = (adjustment.summarise_labels(labels, 4).graph for labels in (stripes(4), shuffled))
+    same, other = adjustment.structure_similarity(a, np.stack([a, b]))
+    assert same == pytest.approx(1)
+    assert other < 1
 
 
 def a_walk(count: int = 4, shake: float = 0.01) -> tuple[list[View], np.ndarray, np.ndarray, np.ndarray]:

@@ -134,7 +134,7 @@ def test_a_loop_that_is_measured_moves_everything(whole: RunFolder) -> None:
     trajectory = whole.load(TRAJECTORY, "mapping")
     ids = trajectory.frame_ids[trajectory.is_keyframe].tolist()
     context = StageContext(whole, whole.root, CONFIG, whole.stage("global_ba"), SilentProgress())
-    recording, fields = stages.Recording(context), whole.load(DEPTH_FIELDS, "tracking")
+    recording, fields = stages.FrameViews(context), whole.load(DEPTH_FIELDS, "tracking")
     gaussian_map = whole.load(MAP, "mapping")
     first, last = (trajectory.cam_from_world[i] for i in (ids[0], ids[-1]))
     motion = last @ np.linalg.inv(first)
@@ -154,7 +154,7 @@ def test_a_loop_that_is_measured_moves_everything(whole: RunFolder) -> None:
 
 def test_a_frame_without_a_pose_measures_nothing(whole: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its pose is the identity, from which the map looks like anything but the frame."""
-    recording = stages.Recording(StageContext(whole, whole.root, CONFIG, whole.stage("tracking"), SilentProgress()))
+    recording = stages.FrameViews(StageContext(whole, whole.root, CONFIG, whole.stage("tracking"), SilentProgress()))
     trajectory, fields = whole.load(TRAJECTORY, "tracking"), whole.load(DEPTH_FIELDS, "tracking")
     recording.held = {1, 2}
     place = np.arange(len(trajectory.frame_ids))
@@ -179,13 +179,13 @@ def test_the_switch_changes_three_stages_and_what_proxies_are() -> None:
 
 def test_a_pose_stays_a_rotation_however_long_the_path(whole: RunFolder) -> None:
     """What rounding adds grows 2.4 times with each prediction of (15) unless a pose is made a rotation again."""
-    recording = stages.Recording(StageContext(whole, whole.root, CONFIG, whole.stage("tracking"), SilentProgress()))
+    recording = stages.FrameViews(StageContext(whole, whole.root, CONFIG, whole.stage("tracking"), SilentProgress()))
     view = recording.views[0]
     slam = Slam(len(recording.class_ids), 0)
     slam._begin(view, PAPER)
     off = torch.eye(4, dtype=torch.float64)
     off[:3, :3] *= 1 + 1e-4
-    kept = slam._beside(view, off, recording.views.__getitem__, PAPER)[:3, :3]
+    kept = slam._adjusted_frame(view, off, recording.views.__getitem__, PAPER)[:3, :3]
     assert float((kept @ kept.T - torch.eye(3)).abs().max()) < 1e-12
 
 
@@ -242,7 +242,7 @@ def test_features_of_dinov2_reach_labels_and_loops(
     config = load_settings(run)
     (folder := tmp_path / "global_ba").mkdir()
     context = StageContext(run, run.root, config, folder, SilentProgress())
-    recording = stages.Recording(context)
+    recording = stages.FrameViews(context)
     ids = [f.id for f in recording.frames]
     image = torch.stack([recording.views[i].colors.mean((0, 1)) for i in ids]).double().numpy()
     seen = (image - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
@@ -253,7 +253,7 @@ def test_features_of_dinov2_reach_labels_and_loops(
         asked.append((summaries, looks))
         return []
 
-    monkeypatch.setattr(stages, "candidates", noted)
+    monkeypatch.setattr(stages, "semantic_candidates", noted)
     every = np.ones(len(ids), bool)
     poses = np.tile(np.eye(4), (len(ids), 1, 1))
     trajectory = Trajectory(np.array(ids), np.arange(len(ids), dtype=float), poses, every, ("",) * len(ids))

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msgs_slam.pipelines.render import reference
+from msgs_slam.pipelines.render import rules
 from msgs_slam.pipelines.types import Intrinsics
 
 NAMES = ("u", "v", "sigma_px", "z", "opacity", "features")
@@ -46,10 +46,10 @@ def dense_composite(gaussians: dict[str, Tensor], width: int, height: int) -> di
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     distance2 = (x.reshape(-1, 1) - u) ** 2 + (y.reshape(-1, 1) - v) ** 2
     raw = opacity * torch.exp(-distance2 / (2 * sigma**2))
-    seen = (distance2 <= (reference.CUT_SIGMAS * sigma) ** 2) & (raw >= reference.ALPHA_MIN)
-    alpha = torch.where(seen, raw.clamp(max=reference.ALPHA_MAX), 0.0)
+    seen = (distance2 <= (rules.CUT_SIGMAS * sigma) ** 2) & (raw >= rules.ALPHA_MIN)
+    alpha = torch.where(seen, raw.clamp(max=rules.ALPHA_MAX), 0.0)
     before = torch.cat([torch.ones_like(alpha[:, :1]), torch.cumprod(1 - alpha, 1)[:, :-1]], 1)
-    weight = torch.where((before >= reference.TRANSMITTANCE_MIN).detach(), alpha * before, 0.0)
+    weight = torch.where((before >= rules.TRANSMITTANCE_MIN).detach(), alpha * before, 0.0)
     images = (weight @ features, weight @ z, weight.sum(1), weight.sum(1))
     shapes = ((height, width, -1), (height, width), (height, width), (height, width))
     return {name: image.reshape(shape) for name, image, shape in zip(IMAGES, images, shapes, strict=True)}

@@ -10,12 +10,13 @@ if not ON_CARD:
     os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported and again when the kernels are
 pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip install '.[cuda-check]'")
 
+import reference  # noqa: E402
 from render_scenes import IMAGES, NAMES, random_gaussians, room  # noqa: E402
 
 from msgs_slam.pipelines.geometry import se3  # noqa: E402
-from msgs_slam.pipelines.render import cuda, cuda_projection, reference  # noqa: E402
+from msgs_slam.pipelines.render import cuda, cuda_projection  # noqa: E402
 from msgs_slam.pipelines.render.api import composite, in_view, render  # noqa: E402
-from msgs_slam.pipelines.render.notes import Notes  # noqa: E402
+from msgs_slam.pipelines.render.rules import GaussianStats  # noqa: E402
 from tests.card_builds import build  # noqa: E402
 
 DEVICE = "cuda" if ON_CARD else "cpu"
@@ -35,7 +36,7 @@ SCENES = {
 
 def assert_agrees(scene, width, height):
     results = []
-    for backend, device, dtype in (("cuda", DEVICE, torch.float32), ("reference", "cpu", torch.float64)):
+    for backend, device, dtype in (("cuda", DEVICE, torch.float32), (reference, "cpu", torch.float64)):
         inputs = {name: x.clone().to(device, dtype).requires_grad_() for name, x in scene.items()}
         image = composite(**inputs, width=width, height=height, backend=backend)
         images = [getattr(image, name) for name in IMAGES]
@@ -90,7 +91,7 @@ def test_full_size_room():
     tensors = [x.to(DEVICE) for x in (scene.means, scene.radii, scene.opacities, scene.colors)]
     pose = torch.eye(4, dtype=torch.float64, device=DEVICE)
     ours = render(*tensors, pose, scene.intrinsics)
-    exact = render(*(x.double() for x in tensors), pose, scene.intrinsics, backend="reference")
+    exact = render(*(x.double() for x in tensors), pose, scene.intrinsics, backend=reference)
     worst = (ours.features - exact.features).abs().amax(-1)
     assert (worst > 1e-4).double().mean() < 1e-3
 
@@ -134,7 +135,7 @@ def test_a_map_is_rendered_as_by_the_reference():
     means = torch.cat([scene.means, scene.means[:40] * torch.tensor([1.0, 1.0, -1.0]), scene.means[:40] * 9])
     rest = [torch.cat([x, x[:40], x[:40]]) for x in (scene.radii, scene.opacities, scene.colors)]
     found = []
-    kinds = (("cuda", DEVICE, torch.float32), ("reference", "cpu", torch.float32), ("reference", "cpu", torch.float64))
+    kinds = (("cuda", DEVICE, torch.float32), (reference, "cpu", torch.float32), (reference, "cpu", torch.float64))
     for backend, device, kind in kinds:
         leaves = [x.to(device, kind, copy=True).requires_grad_() for x in (means, *rest, POSE)]
         image = render(*leaves, scene.intrinsics, backend=backend)
@@ -182,19 +183,19 @@ def test_what_is_in_view_is_marked_as_on_the_cpu():
     assert 20 < len(rows) < 380
 
 
-def test_the_backward_pass_notes_weights_and_errors():
+def test_the_backward_pass_stats_weights_and_errors():
     """As on the CPU. A few Gaussians of the 20,000 on a card gain or lose a pixel at their rim by rounding, as they do
     on the CPU between float32 and float64."""
     scene = room(*SIZE, COUNT, 3)
     found = []
     for backend, device in (("cuda", DEVICE), ("cpu", "cpu")):
         tensors = [x.to(device) for x in (scene.means, scene.radii, scene.opacities, scene.colors)]
-        notes = Notes()
+        stats = GaussianStats()
         tensors[3].requires_grad_()
-        shown = render(*tensors, POSE, scene.intrinsics, backend=backend, notes=notes).features
-        notes.errors = (shown.detach() - 0.3).abs().mean(-1)
+        shown = render(*tensors, POSE, scene.intrinsics, backend=backend, stats=stats).features
+        stats.errors = (shown.detach() - 0.3).abs().mean(-1)
         shown.sum().backward()
-        found.append((notes.largest, notes.answered))
+        found.append((stats.largest, stats.error_share))
     for ours, theirs in zip(*found, strict=True):
         seen = found[1][1] > 0
         assert seen.any()

@@ -1,6 +1,7 @@
 """Median depth and blending weights against what the images already say."""
 
 import pytest
+import reference
 import torch
 from render_scenes import random_gaussians, room
 
@@ -11,10 +12,10 @@ from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.render.inspection import (
     blending_weights,
     class_weights,
-    look,
     median_depth,
+    render_all,
 )
-from msgs_slam.pipelines.render.notes import Notes
+from msgs_slam.pipelines.render.rules import GaussianStats
 
 POSE = torch.eye(4, dtype=torch.float64)
 
@@ -24,9 +25,7 @@ def test_both_backends_agree(seed):
     scene = random_gaussians(3000, 70, 90, 1, seed, sigma=(0.3, 30.0), opacity=(0.01, 0.6))
     arguments = [scene[name] for name in ("u", "v", "sigma_px", "z", "opacity")]
     counts = torch.rand(90, 70, generator=torch.Generator().manual_seed(seed))
-    exact = choose_backend("reference", scene["u"]).inspect(
-        *(x.double() for x in arguments), 70, 90, 0.0, counts.double()
-    )
+    exact = reference.inspect(*(x.double() for x in arguments), 70, 90, 0.0, counts.double())
     for threads in (1, 3):
         set_threads(threads)
         ours = choose_backend("cpu", scene["u"]).inspect(*arguments, 70, 90, 0.0, counts)
@@ -70,7 +69,7 @@ def test_weights_by_class_are_those_of_the_pixels_of_the_class():
     for classes in (1, 4):
         found = torch.zeros(2000, classes).index_add_(0, *class_weights(*seen, *beside, channels, counts, classes))
         exact = (x.double() for x in seen)
-        rows, plain = class_weights(*exact, *beside, channels, counts.double(), classes, backend="reference")
+        rows, plain = class_weights(*exact, *beside, channels, counts.double(), classes, backend=reference)
         assert len(rows) == 2000
         torch.testing.assert_close(found.double(), plain, rtol=1e-4, atol=1e-5)
         counted = torch.where(channels < classes, counts, 0.0)
@@ -79,27 +78,27 @@ def test_weights_by_class_are_those_of_the_pixels_of_the_class():
     assert (found > 0.01).float().mean(0).min() > 0.05
 
 
-def test_the_backward_pass_notes_what_an_inspection_finds():
+def test_the_backward_pass_stats_what_an_inspection_finds():
     """Of every backend; all pixels count for the largest weight, or half of them."""
     scene = room(90, 70, 2000, 1)
     seen, beside = (scene.means, scene.radii, scene.opacities), (POSE, scene.intrinsics)
     weights = blending_weights(*seen, *beside)
     half = (torch.arange(90) < 45).expand(70, 90)
-    for backend, counted in (("cpu", None), ("cpu", half), ("reference", None), ("reference", half)):
-        notes = Notes(counted)
-        shown = render(*seen, scene.colors.clone().requires_grad_(), *beside, backend=backend, notes=notes).features
-        notes.errors = (shown.detach() - 0.3).abs().mean(-1)
+    for backend, counted in (("cpu", None), ("cpu", half), (reference, None), (reference, half)):
+        stats = GaussianStats(counted)
+        shown = render(*seen, scene.colors.clone().requires_grad_(), *beside, backend=backend, stats=stats).features
+        stats.errors = (shown.detach() - 0.3).abs().mean(-1)
         shown.sum().backward()
-        answered = blending_weights(*seen, *beside, counts=notes.errors).total
-        torch.testing.assert_close(notes.answered, answered, rtol=1e-4, atol=1e-5)
+        error_share = blending_weights(*seen, *beside, counts=stats.errors).total
+        torch.testing.assert_close(stats.error_share, error_share, rtol=1e-4, atol=1e-5)
         if counted is None:
-            torch.testing.assert_close(notes.largest, weights.largest, rtol=1e-4, atol=1e-5)
+            torch.testing.assert_close(stats.largest, weights.largest, rtol=1e-4, atol=1e-5)
         else:
             inside = blending_weights(*seen, *beside, counts=half.float()).total
-            assert (notes.largest[inside == 0] == 0).all()
-            assert (notes.largest <= weights.largest + 1e-5).all()
-    assert answered.max() > 0.1
-    shown = render(*seen, scene.colors.clone().requires_grad_(), *beside, notes=Notes()).features
+            assert (stats.largest[inside == 0] == 0).all()
+            assert (stats.largest <= weights.largest + 1e-5).all()
+    assert error_share.max() > 0.1
+    shown = render(*seen, scene.colors.clone().requires_grad_(), *beside, stats=GaussianStats()).features
     with pytest.raises(ValueError, match="errors of the pixels have to be set"):
         shown.sum().backward()
 
@@ -117,7 +116,7 @@ def test_what_is_in_view_is_all_that_a_picture_depends_on():
     """On both backends, and no more than a rim beside it."""
     scene = room(64, 48, 2000, 1)
     turned = se3.exp(torch.tensor([0.3, 0.0, 0.2, 0.0, 0.5, 0.1], dtype=torch.float64))
-    for backend, kind in (("cpu", torch.float32), ("reference", torch.float64)):
+    for backend, kind in (("cpu", torch.float32), (reference, torch.float64)):
         arguments = [x.to(kind) for x in (scene.means, scene.radii, scene.opacities, scene.colors)]
         rows = in_view(*arguments[:2], turned, scene.intrinsics)
         part, whole = (
@@ -136,7 +135,7 @@ def test_one_look_shows_what_single_drawings_show(classes):
     logits = 3 * torch.rand(2000, classes, generator=torch.Generator().manual_seed(classes)) ** 2
     ids = torch.zeros(2000, dtype=torch.int64)
     own = GaussianMap(scene.means, scene.radii.log(), scene.opacities.logit(), scene.colors, logits, ids)
-    found, exact = look(own, POSE, k), look(own, POSE, k, backend="reference")
+    found, exact = render_all(own, POSE, k), render_all(own, POSE, k, backend=reference)
     with torch.no_grad():
         drawn = render(own.means, own.radii, own.opacities, own.colors, POSE, k)
     assert torch.equal(found.colors, drawn.features)

@@ -1,12 +1,13 @@
 """The reference renderer against a dense table of all pixels and Gaussians, and against finite differences."""
 
 import pytest
+import reference
 import torch
 from render_scenes import IMAGES, NAMES, dense_composite, random_gaussians
 from torch import Tensor
 
-from msgs_slam.pipelines.render import reference
 from msgs_slam.pipelines.render.api import composite
+from msgs_slam.pipelines.render.rules import ALPHA_MIN
 
 WIDTH, HEIGHT = 23, 17
 
@@ -21,7 +22,7 @@ def test_images_and_gradients_equal_the_dense_table(count, opacity):
     torch.manual_seed(0)
     upstream = [torch.randn(HEIGHT, WIDTH, 3).double(), *torch.randn(3, HEIGHT, WIDTH).double()]
     ours, dense = leaves(scene), leaves(scene)
-    image = composite(**ours, width=WIDTH, height=HEIGHT, backend="reference")
+    image = composite(**ours, width=WIDTH, height=HEIGHT, backend=reference)
     expected = dense_composite(dense, WIDTH, HEIGHT)
     for name in IMAGES:
         torch.testing.assert_close(getattr(image, name), expected[name], rtol=0, atol=1e-9)
@@ -38,14 +39,14 @@ def test_gradients_equal_finite_differences():
     scene = random_gaussians(6, 5, 4, 2, seed=3, sigma=(0.8, 2.0), opacity=(0.2, 0.9), behind=0.0)
 
     def images(*tensors):
-        image = composite(*tensors, 5, 4, backend="reference")
+        image = composite(*tensors, 5, 4, backend=reference)
         return tuple(getattr(image, name) for name in IMAGES)
 
     # Where a Gaussian ends, its opacity jumps: no finite difference may cross that circle.
     u, v, sigma, opacity = (scene[name].double() for name in ("u", "v", "sigma_px", "opacity"))
     x, y = torch.meshgrid(torch.arange(5) + 0.5, torch.arange(4) + 0.5, indexing="xy")
     distance = ((x.reshape(-1, 1) - u) ** 2 + (y.reshape(-1, 1) - v) ** 2).sqrt()
-    reach = sigma * (2 * torch.log(opacity / reference.ALPHA_MIN)).clamp(max=9).sqrt()
+    reach = sigma * (2 * torch.log(opacity / ALPHA_MIN)).clamp(max=9).sqrt()
     assert (distance - reach).abs().min() > 1e-4
     assert torch.autograd.gradcheck(images, tuple(leaves(scene).values()), eps=1e-6, atol=1e-6)
 
@@ -56,6 +57,6 @@ def test_depth_is_normalised_by_the_silhouette():
         "u": torch.full((2,), 1.5), "v": torch.full((2,), 1.5), "sigma_px": torch.full((2,), 50.0),
         "z": torch.tensor([1.0, 3.0]), "opacity": torch.full((2,), 0.9), "features": torch.eye(2),
     }  # fmt: skip
-    image = composite(**two, width=3, height=3, backend="reference")
+    image = composite(**two, width=3, height=3, backend=reference)
     assert (image.depth_silhouette == image.silhouette).all()
     assert (image.depth_sum / image.depth_silhouette)[1, 1] == pytest.approx(0.9 * 1 / 0.99 + 0.09 * 3 / 0.99, abs=1e-2)
