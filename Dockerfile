@@ -3,7 +3,7 @@
 #
 #   docker run --rm -v "$PWD:/data" -v msgs-cache:/cache msgs-slam reconstruct video.mp4
 #   docker run --rm --gpus all -v "$PWD:/data" -v msgs-cache:/cache msgs-slam:cuda reconstruct video.mp4
-#   docker run --rm -p 127.0.0.1:8080:8080 -v "$PWD:/data" msgs-slam view video.msgs --host 0.0.0.0
+#   docker run --rm --network host -v "$PWD:/data" msgs-slam view video.msgs
 ARG PYTHON=3.12
 FROM python:${PYTHON}-slim AS build
 WORKDIR /src
@@ -27,11 +27,10 @@ COPY --from=build /wheels /wheels
 RUN if [ "$DEVICE" = cpu ]; then \
         pip install --no-cache-dir --index-url https://download.pytorch.org/whl/cpu "torch>=2.6,<2.14"; \
     fi \
-    && pip install --no-cache-dir "$(ls /wheels/msgs_slam-*.whl)[viewer]"
+    && pip install --no-cache-dir /wheels/msgs_slam-*.whl
 RUN useradd --uid 1000 --create-home user && mkdir /data /cache && chown 1000 /data /cache
 USER 1000
 ENV MSGS_SLAM_CACHE=/cache/models NUMBA_CACHE_DIR=/cache/kernels
 WORKDIR /data
-EXPOSE 8080
 ENTRYPOINT ["msgs-slam"]
 CMD ["doctor"]

@@ -16,7 +16,7 @@ demo:
 	nvidia-smi > /dev/null 2>&1 || $(VENV)/bin/python -c 'import torch' 2> /dev/null || \
 		{ echo "No NVIDIA driver: PyTorch for the CPU."; $(VENV)/bin/python $(PIP) --retries 1 $(CPU_TORCH); } || \
 		echo "download.pytorch.org cannot be reached: the PyTorch of PyPI, with CUDA."
-	$(VENV)/bin/python $(PIP) '.[viewer]'
+	$(VENV)/bin/python $(PIP) .
 	$(VENV)/bin/msgs-slam models pull --yes || echo "Continuing without networks: fewer class names, less certain scale."
 	$(VENV)/bin/msgs-slam demo
 
@@ -39,7 +39,7 @@ docs: $(TESTED)/.installed
 
 $(TESTED)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(TESTED)
-	$(TESTED)/bin/python $(PIP) '.[dev,docs,cuda-check,viewer]'
+	$(TESTED)/bin/python $(PIP) '.[dev,docs,cuda-check]'
 	touch $@
 
 clean:

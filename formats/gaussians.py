@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,20 +60,6 @@ class GaussianCloud:
         """Select Gaussians by a mask (M,) or by indices."""
         chosen: dict[str, Any] = {name: None if a is None else a[rows] for name, a in vars(self).items()}
         return GaussianCloud(**chosen)
-
-
-def unit_quaternions(quat: NDArray) -> NDArray[np.float32]:
-    """Return (M, 4) of length 1: trainers store them as the optimiser left them, packed files rounded. Zero is no
-    rotation."""
-    wide = quat.astype(np.float64)
-    length = np.linalg.norm(wide, axis=1, keepdims=True)
-    identity = np.array([1.0, 0, 0, 0])
-    return np.where(length > 1e-12, wide / np.maximum(length, 1e-12), identity).astype(np.float32)
-
-
-def parts_of(cloud: GaussianCloud | Sequence[GaussianCloud]) -> Sequence[GaussianCloud]:
-    """Return the parts, at least one, that a cloud is given in: a sequence may make each as it is asked for."""
-    return [cloud] if isinstance(cloud, GaussianCloud) else cloud
 
 
 def isotropic_cloud(

@@ -8,16 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InputError
-from .glb import UNLIT, Part, glb_parts, linear, material, write_primitive
+from .glb import LABEL, UNLIT, Part, glb_parts, linear, material, write_primitive
 from .images import decode_rgb, jpeg_bytes
-from .ply import Rows, columns, read_ply, read_rows, write_ply
+from .ply import Rows, read_ply_rows, write_ply
 from .reading import parsing, read_bytes
 from .trajectory import FARTHEST
 
 _LINEAR, _MIPMAPPED, _CLAMPED = 9729, 9987, 33071
 
-_LABEL_ATTRIBUTE = "_LABEL"
 _PLACE, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 _VERTEX = np.dtype([*((n, "<f4") for n in _PLACE), *((n, "u1") for n in (*_COLOR, "label"))])
 _FACE = np.dtype([("vertex_indices", "<i4", (3,))])
@@ -89,7 +87,7 @@ def _face_rows(faces: NDArray[np.int32], count: int) -> NDArray[Any]:
 
 def mesh_blocks(path: Path) -> MeshBlocks:
     """Return the mesh of a PLY by `write_mesh_ply`. Raises InputError for another file."""
-    vertex, face = read_rows(path, _LISTED).values()
+    vertex, face = read_ply_rows(path, _LISTED).values()
 
     def vertices() -> Iterator[tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]]:
         for rows in vertex.blocks:
@@ -100,43 +98,11 @@ def mesh_blocks(path: Path) -> MeshBlocks:
 
 
 def read_mesh_ply(path: Path) -> MeshArrays:
-    """Read a triangle mesh from a PLY by this or another program; polygons are cut into triangle fans.
-
-    Vertices without colours are grey, without labels 255. Raises InputError for a file that is no mesh.
-    """
-    path = Path(path)
-    vertex, faces = _own_tables(path) or _tables(path)
-    names = vertex.dtype.names or ()
-    count = len(vertex)
-    has_colors = {"red", "green", "blue"} <= set(names)
-    colors = columns(vertex, ["red", "green", "blue"], path) if has_colors else np.full((count, 3), 128, np.float32)
-    colors = colors.clip(0, 255)
-    labels = columns(vertex, ["label"], path)[:, 0].clip(0, 255) if "label" in names else np.full(count, 255)
+    """Read a mesh by `write_mesh_ply`. Raises InputError for another file."""
+    vertex, face = (np.concatenate([np.zeros(0, r.dtype), *r.blocks]) for r in read_ply_rows(path, _LISTED).values())
+    points, colors = (np.stack([vertex[n] for n in names], 1) for names in (_PLACE, _COLOR))
     with parsing(path, "mesh", "export it again"):
-        return MeshArrays(
-            columns(vertex, ["x", "y", "z"], path), _triangles(faces, count), colors.astype(np.uint8),
-            labels.astype(np.uint8),
-        )  # fmt: skip
-
-
-def _own_tables(path: Path) -> tuple[NDArray[Any], NDArray[Any]] | None:
-    """Vertices and corners of faces of a PLY by `write_mesh_ply`; None for any other."""
-    try:
-        tables = [np.concatenate([np.zeros(0, r.dtype), *r.blocks]) for r in read_rows(path, _LISTED).values()]
-    except InputError:
-        return None
-    return tables[0], tables[1]["vertex_indices"]
-
-
-def _tables(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
-    ply = read_ply(path)
-    if "vertex" not in ply or "face" not in ply:
-        raise InputError(f"{path} has no faces: it is a point cloud or a splat file, not a mesh")
-    face = ply["face"].data
-    indices = next((n for n in ("vertex_indices", "vertex_index") if n in (face.dtype.names or ())), None)
-    if indices is None:
-        raise InputError(f"{path}: its faces have no vertex_indices: it is no mesh this program can read")
-    return ply["vertex"].data, face[indices]
+        return MeshArrays(points, np.ascontiguousarray(face["vertex_indices"]), colors, vertex["label"].copy())
 
 
 def write_mesh_glb(
@@ -160,24 +126,11 @@ def write_mesh_glb(
         Part("POSITION", mesh.vertex_count, 3, "<f4", positions(), box),
         Part("COLOR_0", mesh.vertex_count, 3, "<f4", colors),
         # glTF wants every vertex at a multiple of 4 bytes: a float per label instead of a byte
-        Part(_LABEL_ATTRIBUTE, mesh.vertex_count, 1, "<f4", (labels for _, _, labels in mesh.vertices())),
+        Part(LABEL, mesh.vertex_count, 1, "<f4", (labels for _, _, labels in mesh.vertices())),
         Part("", 3 * mesh.face_count, 1, "<u4", mesh.faces()),
     ]
     primitive, extras = {"mode": 4, "material": 0}, {"materials": [material()]}
     write_primitive(path, parts, primitive, class_names, {"name": "mesh"}, extras, [UNLIT])
-
-
-def _triangles(polygons: NDArray, vertices: int) -> NDArray[np.int32]:
-    """(F, 3) of faces given as an (F, n) array, or as n indices each in an array of objects; ValueError for others."""
-    if polygons.dtype != object:
-        listed = polygons.astype(np.int64)
-        if listed.size and not 0 <= listed.min() <= listed.max() < vertices:
-            raise ValueError(f"a face points outside the {vertices} vertices")
-        fans = [listed[:, [0, i, i + 1]] for i in range(1, listed.shape[1] - 1)] if listed.ndim == 2 else []
-        return np.concatenate(fans).astype(np.int32) if fans else np.zeros((0, 3), dtype=np.int32)
-    counts = np.array([len(p) for p in polygons])
-    parts = [_triangles(np.stack(list(polygons[counts == n])), vertices) for n in np.unique(counts) if n >= 3]
-    return np.concatenate(parts).astype(np.int32) if parts else np.zeros((0, 3), dtype=np.int32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +170,7 @@ def write_textured_glb(path: Path, mesh: TexturedMesh, class_names: tuple[str, .
     parts = [
         Part.of("POSITION", mesh.vertices[mesh.corner_vertex]),
         Part.of("TEXCOORD_0", mesh.corner_uv),
-        Part.of("_LABEL", mesh.labels[mesh.corner_vertex].astype(np.float32)),
+        Part.of(LABEL, mesh.labels[mesh.corner_vertex].astype(np.float32)),
         Part.of("", mesh.faces.reshape(-1).astype(np.uint32)),
     ]
     extras = {

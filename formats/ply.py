@@ -1,23 +1,19 @@
-"""PLY files: tables of vertices read with limits and written in blocks, clouds of points, and Gaussian splats in the
-layout of the original 3D Gaussian splatting (Kerbl et al. 2023)."""
+"""PLY files: tables written in blocks and read again, clouds of points, and Gaussians as the original 3D Gaussian
+splatting stores them (Kerbl et al. 2023)."""
 
-import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .atomic import atomic_path
 from .errors import InputError
-from .gaussians import GaussianCloud, parts_of, unit_quaternions
-from .reading import opened, parsing
-
-if TYPE_CHECKING:
-    from plyfile import PlyData  # under the GPL: imported for PLY files of other programs only
+from .gaussians import GaussianCloud
+from .reading import opened
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * f_dc."""
@@ -34,39 +30,10 @@ _VERTEX = np.dtype([
 _MAX_HEADER_BYTES = 1 << 20
 _ROWS = 1 << 18
 """That are written at once."""
-_MIN_BYTES_PER_ASCII_VALUE = 2
-_LARGEST = float(np.finfo(np.float32).max)
-_SIZES = {
-    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
-    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
-    **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
-    **dict.fromkeys(("double", "float64"), 8),
-}
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"} | {
     "f4": "float",
     "f8": "double",
 }
-
-
-def read_ply(path: Path) -> "PlyData":
-    """Read a PLY file by plyfile. Raises InputError when it is missing, a git-LFS pointer, no PLY, or cut short."""
-    with opened(path) as file:
-        head = file.read(_MAX_HEADER_BYTES)
-    if not head.startswith(b"ply"):
-        raise InputError(f"{path} is no PLY file (it does not begin with 'ply'): check that it is the right file")
-    _require_whole(path, head)
-    with parsing(path, "PLY file"):
-        return _parsed(path)
-
-
-def _parsed(path: Path) -> "PlyData":
-    """By mapping where all rows have the same length: plyfile's other way takes 20 s for half a million rows."""
-    from plyfile import PlyData, PlyElementParseError
-
-    try:
-        return PlyData.read(str(path), mmap="c", known_list_len={"face": {"vertex_indices": 3, "vertex_index": 3}})
-    except PlyElementParseError:
-        return PlyData.read(str(path), mmap=False)  # not all faces are triangles
 
 
 @dataclass(frozen=True)
@@ -103,8 +70,8 @@ def slices(count: int) -> Iterator[slice]:
     return (slice(start, min(start + _ROWS, count)) for start in range(0, count, _ROWS))
 
 
-def read_rows(path: Path, elements: dict[str, np.dtype]) -> dict[str, Rows]:
-    """Read the elements of a PLY by `write_ply`, of which nothing is read before their blocks are.
+def read_ply_rows(path: Path, elements: dict[str, np.dtype]) -> dict[str, Rows]:
+    """Open the elements of a PLY by `write_ply`; blocks are read lazily.
 
     `elements`: all of them in their order, a list as its length and its values. Raises InputError for a file that is
     missing or has others.
@@ -159,48 +126,6 @@ def _packed(array: NDArray[Any]) -> NDArray[Any]:
     return packed
 
 
-def columns(vertex: NDArray[Any], names: list[str], path: Path) -> NDArray[np.float32]:
-    """Return (rows, names) float32 of these properties, infinity as the largest number there is.
-
-    Raises InputError naming those that are missing or hold NaN.
-    """
-    present = vertex.dtype.names or ()
-    missing = [name for name in names if name not in present]
-    if missing:
-        raise InputError(f"{path} lacks the properties {', '.join(missing)}: it is another kind of PLY")
-    with parsing(path, "PLY of numbers"):
-        values = np.stack([np.clip(vertex[name], -_LARGEST, _LARGEST).astype(np.float32) for name in names], axis=1)
-    if np.isnan(values).any():
-        raise InputError(f"{path}: {', '.join(names)} hold values that are no numbers: export it again")
-    return values
-
-
-def _require_whole(path: Path, head: bytes) -> None:
-    """Compare the counts in the header with the size of the file, before anyone allocates for them."""
-    found = re.search(rb"[\r\n]end_header", head)
-    end = found.start() + 1 if found else -1
-    if end < 0:
-        raise InputError(f"{path} has no PLY header end: it is damaged, copy or export it again")
-    available = Path(path).stat().st_size - end
-    is_ascii = b"format ascii" in head[:end]
-    counts, row_bytes = [0], [0]
-    for line in head[:end].decode("ascii", errors="replace").splitlines():
-        words = line.split()
-        if len(words) == 3 and words[0] == "element":
-            counts.append(int(words[2]) if words[2].isdecimal() and len(words[2]) < 16 else 1 << 60)
-            row_bytes.append(0)
-        elif len(words) >= 3 and words[0] == "property":
-            smallest = 1 if words[1] == "list" else _SIZES.get(words[1], 1)
-            row_bytes[-1] += _MIN_BYTES_PER_ASCII_VALUE if is_ascii else smallest
-    # Rows without properties take no space, and have no sense either.
-    needed = sum(count * max(size, 1) for count, size in zip(counts, row_bytes, strict=True))
-    if needed > available:
-        raise InputError(
-            f"{path} declares {needed / 1e6:.1f} MB of data and contains {available / 1e6:.1f}: "
-            "it was not copied completely, copy or export it again"
-        )
-
-
 def write_point_ply(path: Path, points: NDArray[np.float64], colors: NDArray[np.uint8]) -> None:
     """Write points (P, 3) and colors (P, 3) uint8 with normals of zero, which the original trainer insists on.
 
@@ -237,7 +162,7 @@ def write_gaussian_ply(
     fields = [*_MEANS, *_NORMALS, *_DC, *(f"f_rest_{i}" for i in range(_REST_COUNTS[sh_degree]))]
     fields += ["opacity", *_SCALES, *_ROTATION]
     dtype: list[tuple[str, str]] = [(name, "<f4") for name in fields]
-    parts, count, found = parts_of(cloud), 0, set[int]()
+    parts, count, found = [cloud] if isinstance(cloud, GaussianCloud) else cloud, 0, set[int]()
     for part in parts:
         count += len(part)
         if part.class_probs is not None:
@@ -265,70 +190,8 @@ def _rows(cloud: GaussianCloud, rows: slice, dtype: np.dtype, occurring: list[in
     return vertex
 
 
-def read_gaussian_ply(path: Path) -> GaussianCloud:
-    """Read the Gaussians of a PLY by this or another program, of any spherical-harmonic degree.
-
-    Raises InputError when the file is missing, damaged, a git-LFS pointer, or a PLY of another kind.
-    """
-    path = Path(path)
-    ply = read_ply(path)
-    if "vertex" not in ply:
-        raise InputError(f"{path} has no vertices: it is no Gaussian splat PLY")
-    vertex = ply["vertex"].data
-    names = vertex.dtype.names or ()
-    if "packed_position" in names:
-        raise InputError(
-            f"{path} is a compressed PLY of SuperSplat (PlayCanvas), which is not supported: export it there again as "
-            "an uncompressed PLY, or as .spz or .splat"
-        )
-    if not set(_SCALES[:1] + _DC) <= set(names):
-        kind = "a mesh" if "face" in ply else "a point cloud"
-        raise InputError(f"{path} is {kind}, not a Gaussian splat PLY: it lacks f_dc_0..2 and scale_0..2")
-    with parsing(path, "Gaussian splat PLY"):
-        return _cloud(ply, path)
-
-
-def _cloud(ply: "PlyData", path: Path) -> GaussianCloud:
-    vertex = ply["vertex"].data
-    names = vertex.dtype.names or ()
-    return GaussianCloud(
-        means=columns(vertex, _MEANS, path),
-        log_scales=_log_scales(vertex, path),
-        quat_wxyz=unit_quaternions(columns(vertex, _ROTATION, path)),
-        opacity_logits=columns(vertex, ["opacity"], path)[:, 0],
-        colors=columns(vertex, _DC, path) * np.float32(SH_C0) + np.float32(0.5),
-        class_ids=vertex["class_id"].astype(np.uint8) if "class_id" in names else None,
-        class_probs=_class_probs(vertex, ply.comments, path),
-    )
-
-
 def _fill(vertex: NDArray[Any], names: list[str], values: NDArray[np.float32]) -> None:
     if not np.isfinite(values).all():
         raise ValueError(f"write_gaussian_ply: {names[0]} holds a value that is not finite")
     for i, name in enumerate(names):
         vertex[name] = values[:, i]
-
-
-def _log_scales(vertex: NDArray[Any], path: Path) -> NDArray[np.float32]:
-    """Flat splats (2D Gaussian splatting) have two scales only: the third is made thin."""
-    names = [name for name in _SCALES if name in (vertex.dtype.names or ())]
-    scales = columns(vertex, names if len(names) == 2 else _SCALES, path)
-    thin = (
-        scales.min(axis=1, keepdims=True, initial=0) - np.float32(math.log(100)) if len(names) == 2 else scales[:, :0]
-    )
-    return np.concatenate([scales, thin], axis=1)
-
-
-def _class_probs(vertex: NDArray[Any], comments: list[str], path: Path) -> NDArray[np.float32] | None:
-    """(M, C) for as many classes as the comments name, or as are there; those without a property are 0."""
-    names = [n for n in vertex.dtype.names or () if n.startswith(_PROB) and n[len(_PROB) :].isdecimal()]
-    if not names:
-        return None
-    classes = [int(n[len(_PROB) :]) for n in names]
-    named = [int(found[1]) for c in comments if (found := re.match(r"class (\d+) ", c + " "))]
-    count = max(*classes, *named, 0) + 1
-    if count > 255:
-        raise InputError(f"{path} has a class {count - 1}: class numbers end at 254")
-    out = np.zeros((len(vertex), count), np.float32)
-    out[:, classes] = columns(vertex, names, path)
-    return out

@@ -63,8 +63,8 @@ def write_sog(path: Path, cloud: GaussianCloud) -> None:
 
 
 def _codebook(values: Array) -> tuple[Array, NDArray[np.uint8]]:
-    """256 values that represent all (M, 3), and which of them represents each: Lloyd's rounds from shares as
-    even as steps, so that what is rare is met too."""
+    """256 values for all (M, 3), and the index of the nearest for each: k-means, initialised half by quantiles and half
+    uniformly so that rare values are kept."""
     flat, even = values.ravel(), np.linspace(0, 1, _LEVELS // 2)
     book = np.sort(np.append(np.quantile(flat, even), flat.min() + np.ptp(flat) * even))
     for _ in range(_ROUNDS):

@@ -110,7 +110,7 @@ def save_safetensors(path: Path, arrays: Mapping[str, NDArray]) -> None:
 
     Raises InputError when the disk refuses.
     """
-    # The library holds all of it in memory twice before it writes, which were the peak of a mapping.
+    # The library holds all of it in memory twice before it writes, which would be the peak memory of the mapping stage.
     contiguous = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     names = sorted(contiguous, key=lambda name: (-contiguous[name].itemsize, name))  # so that each is aligned
     header: dict[str, Any] = {}

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import click
 
-from ..formats.errors import install_command, install_extra
+from ..formats.errors import install_command
 from ..pipelines.system.wording import BAD, GOOD, NOTE, Finding
 from .output import say
 
 DISTRIBUTION = "msgs-slam"
 _MODULES = (
-    "torch", "cv2", "pycolmap", "numba", "onnxruntime", "scipy", "skimage", "PIL", "trimesh", "plyfile", "safetensors"
+    "torch", "cv2", "pycolmap", "numba", "onnxruntime", "scipy", "skimage", "PIL", "trimesh", "safetensors"
 )  # fmt: skip
 _MIN_MEMORY, _MIN_DISK = 4.0, 3.0
 """Gigabytes: the largest run of the benchmarks peaks at 1.8 and fills 0.5."""
@@ -51,7 +51,7 @@ def examine(folder: Path) -> list[Finding]:
     """Every check in order; `folder` is where runs would be written. Never raises: what fails is a finding."""
     checks: tuple[tuple[str, Callable[[], Finding]], ...] = (
         ("program", _program), ("requirements", _requirements), ("libraries", _libraries), ("video", _video),
-        ("viewer", _viewer), ("threads", _threads), ("memory", _memory), ("gpu", _gpu), ("models", _models),
+        ("threads", _threads), ("memory", _memory), ("gpu", _gpu), ("models", _models),
         ("compiled kernels", _kernels), ("disk", lambda: _disk(folder)),
     )  # fmt: skip
     return [_guarded(name, check) for name, check in checks]
@@ -130,12 +130,6 @@ def _video() -> Finding:
         fix = install_command("--force-reinstall", "opencv-python-headless")
         return Finding("video", BAD, f"{read} of {len(frames)} frames came back from an MP4", fix)
     return Finding("video", GOOD, "MP4 read and write work")
-
-
-def _viewer() -> Finding:
-    if importlib.util.find_spec("viser") is None:
-        return Finding("viewer", NOTE, "`msgs-slam view` is not installed", install_extra("viewer"))
-    return Finding("viewer", GOOD, f"viser {importlib.metadata.version('viser')}")
 
 
 def _threads() -> Finding:

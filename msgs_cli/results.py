@@ -79,34 +79,24 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | No
 @click.option(
     "--to", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Default: report.html in the run."
 )
-@click.option("--pdf", is_flag=True, help="Also write a PDF; needs Chromium or Chrome.")
 @OVERWRITE
 @verbosity_options
-def report(run_path: Path, to: Path | None, pdf: bool, overwrite: bool, output: Output) -> None:
+def report(run_path: Path, to: Path | None, overwrite: bool, output: Output) -> None:
     """Write one HTML file that says what was found, how good it is, and what to film better.
 
     \b
     Example: msgs-slam report video.msgs --to report.html
     """
     if to is not None and to.suffix.lower() == ".pdf":
-        raise click.UsageError(
-            f"--to {to}: it names the HTML file, {to.with_suffix('.html')}; with --pdf the PDF is made beside it"
-        )
+        raise click.UsageError(f"--to {to}: a report is an HTML file, {to.with_suffix('.html')}; print it in a browser")
     run = open_run(run_path)
-    from ..pipelines.evaluation.html import find_browser
     from ..pipelines.evaluation.report import write_report
 
     use_threads(run)
-    browser = find_browser() if pdf else ""
     with on_sigterm(signal.SIG_DFL):
-        page = write_report(run, to, output.progress(), browser, overwrite)
-    made = [page, page.with_suffix(".pdf")] if pdf else [page]
-    for path in made:
-        say(path)
-    output.report_result(report=made[0], **dict(zip(["pdf"], made[1:], strict=False)))
-
-
-SPLAT_FILES = (".ply", ".spz", ".glb", ".splat", ".safetensors")
+        page = write_report(run, to, output.progress(), overwrite)
+    say(page)
+    output.report_result(report=page)
 
 
 class Size(click.ParamType):
@@ -124,11 +114,11 @@ class Size(click.ParamType):
 
 
 @click.command()
-@click.argument("source", metavar="RUN|FILE", type=click.Path(path_type=Path))
+@RUN_ARGUMENT
 @click.argument("target", metavar="VIDEO|FOLDER", type=click.Path(path_type=Path))
 @click.option(
-    "--kind", default="color", show_default=True, type=click.Choice(["color", "depth", "labels", "side-by-side"]),
-    help="What is drawn; side-by-side: all three, three times as wide.",
+    "--kind", default="color", show_default=True, type=click.Choice(["color", "depth", "labels"]),
+    help="What is drawn.",
 )  # fmt: skip
 @click.option(
     "--path", "camera_path", default="smooth", show_default=True, metavar="own|smooth|orbit|FILE",
@@ -144,11 +134,10 @@ class Size(click.ParamType):
 @OVERWRITE
 @verbosity_options
 def render(
-    source: Path, target: Path, kind: str, camera_path: str, fps: float | None, size: tuple[int, int] | None,
+    run_path: Path, target: Path, kind: str, camera_path: str, fps: float | None, size: tuple[int, int] | None,
     overwrite: bool, output: Output,
 ) -> None:  # fmt: skip
-    """Render the map of RUN along a camera path, or any splat FILE (.ply, .spz, .glb, .splat) along an orbit or a
-    recorded path, into a video or a folder of images.
+    """Render the map of RUN along a camera path into a video or a folder of images.
 
     An .mp4 is H.264 where PyAV is installed (the extra [hdr]), else VP9: browsers play both. .avi and
     .mkv are lossless (FFV1).
@@ -156,44 +145,34 @@ def render(
     \b
     Example: msgs-slam render video.msgs orbit.mp4 --path orbit
     """
-    is_file = source.is_file() and source.suffix.lower() in SPLAT_FILES
-    if is_file and (kind != "color" or camera_path == "own"):
-        raise click.UsageError("a splat file has colours and no cameras: --kind color, --path orbit or FILE")
-    run = None if is_file else open_run(source)
-    from ..pipelines.viewer.render_run import render_file, render_run
+    run = open_run(run_path)
+    from ..pipelines.evaluation.film import render_run
 
     use_threads(run)
     with on_sigterm(signal.SIG_DFL):
-        if run is None:
-            made = render_file(source, target, fps, output.progress(), size, camera_path, output.report, overwrite)
-        else:
-            made = render_run(run, target, kind, camera_path, fps, output.progress(), size, output.report, overwrite)
+        made = render_run(run, target, kind, camera_path, fps, output.progress(), size, output.report, overwrite)
     say(made)
     output.report_result(video=made)
 
 
 @click.command()
-@click.argument("path", metavar="RUN|FILE", type=click.Path(path_type=Path, exists=True))
-@click.option("--port", default=8080, type=click.IntRange(1, 65535), show_default=True, help="Where to serve.")
-@click.option("--host", default="127.0.0.1", show_default=True, help="Which address to serve on.")
-def view(path: Path, port: int, host: str) -> None:
-    """View a run, or any splat file (.ply, .spz, .glb, .splat), in the browser.
+@RUN_ARGUMENT
+@click.option("--port", default=0, type=click.IntRange(0, 65535), help="Where to serve. Default: any free one.")
+def view(run_path: Path, port: int) -> None:
+    """View RUN in the browser: serve its map's page on this machine, to this machine alone.
 
     A run that is not finished shows what its stages have made by now, and more as soon as another one ends.
 
-    Needs the extra [viewer]: pip install '.[viewer]' in the checkout.
+    \b
+    Example: msgs-slam view video.msgs
     """
-    run = open_run(path) if path.is_dir() else None
-    from ..pipelines.viewer.server import open_viewer
+    run = open_run(run_path)
+    from ..pipelines.evaluation.serve import PageServer
 
     use_threads(run)
     try:
-        with on_sigterm(signal.default_int_handler):
-            viewer = open_viewer(path, host, port)
-            say(f"open {viewer.url} in a browser; Ctrl-C ends it", err=True)
-            try:
-                viewer.wait()
-            finally:
-                viewer.stop()
+        with on_sigterm(signal.default_int_handler), PageServer(run, port) as server:
+            say(f"open {server.url} in a browser; Ctrl-C ends it", err=True)
+            server.serve_forever()
     except KeyboardInterrupt:
         return

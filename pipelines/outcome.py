@@ -150,18 +150,23 @@ class Outcome:
 
     def pieces(self) -> list[Outcome]:
         """Load the disconnected components, each in a world of its own, largest first, as far as they are done."""
-        pieces = {name: self.run.piece(name) for name in self.run.pieces("tracking")}
-        return [
-            load_outcome(piece)
-            for name, piece in pieces.items()
-            if piece.manifest_file.exists()
-            and "tracking" in load_records(piece)
-            and load_source(piece).digest == piece_digest(self.records, name)  # not one of an earlier result
-        ]
+        return [load_outcome(piece) for piece in runs_of_pieces(self.run, self.records)]
 
     def frame_row(self, frame_id: int) -> int:
         """Row of a frame in the trajectory."""
         return int(np.flatnonzero(self.trajectory.frame_ids == frame_id)[0])
+
+
+def runs_of_pieces(run: RunFolder, records: Mapping[str, StageRecord]) -> list[RunFolder]:
+    """Find the runs of the disconnected components, largest first, whose tracking is done."""
+    pieces = {name: run.piece(name) for name in run.pieces("tracking")}
+    return [
+        piece
+        for name, piece in pieces.items()
+        if piece.manifest_file.exists()
+        and "tracking" in load_records(piece)
+        and load_source(piece).digest == piece_digest(records, name)  # not one of an earlier result
+    ]
 
 
 def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:

@@ -1,4 +1,4 @@
-"""A tab of headless Chromium, driven over the browser's own protocol."""
+"""A tab of headless Chromium, driven over the browser's own protocol; and scripts of pages run by node."""
 
 import base64
 import json
@@ -129,3 +129,14 @@ def browser(profile: Path, size: tuple[int, int] = (760, 520), *flags: str) -> I
     finally:
         process.terminate()
         process.wait()
+
+
+def in_node(scripts: str, expression: str, **values: Any) -> Any:
+    """What an expression of the scripts, which may be a promise, is as JSON; `values` are names in it."""
+    if not (node := shutil.which("node")):
+        pytest.skip("needs node")
+    given = "".join(f"const {name} = {json.dumps(value)};\n" for name, value in values.items())
+    program = f"{scripts}\n{given}(async () => process.stdout.write(JSON.stringify(await {expression})))();"
+    done = subprocess.run([node, "-"], input=program, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr[-1000:]
+    return json.loads(done.stdout)

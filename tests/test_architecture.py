@@ -22,7 +22,7 @@ FLOORS = (
     {"config", "types"}, {"geometry", "read_config"}, {"providers", "system"}, {"compute"},
     {"render", "networks"}, {"depth"}, {"run", "sfm"}, {"source"},
     {"labels", "masks"}, {"frames", "proxy"}, {"mapping", "tracking"}, {"global_ba", "outcome"},
-    {"paper", "scene"}, {"export"}, {"reconstruct"}, {"batch", "evaluation"}, {"viewer"},
+    {"paper", "scene"}, {"export"}, {"reconstruct"}, {"batch", "evaluation"},
 )  # fmt: skip
 """The rooms of pipelines/: its folders and its flat files, each above all that it imports."""
 MOST_FLAT = 8

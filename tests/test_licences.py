@@ -10,7 +10,6 @@ from tests.test_architecture import ROOT
 
 PERMISSIVE = re.compile(r"apache|bsd|mit|mpl|psf|python software|zlib|cc0|hpnd|isc|bsl", re.IGNORECASE)
 COPYLEFT = {
-    "plyfile": "GPL-3.0-or-later",  # reads PLY files of other programs, and is imported for them only
     "pi-heif": "LGPL-3.0",  # decodes HEIC; its libraries are linked dynamically
 }
 """Packages under the GPL or LGPL by their own statement, which the documentation names."""
@@ -72,7 +71,7 @@ def mentions_gpl(package: importlib.metadata.Distribution) -> bool:
 
 def test_a_plain_install_brings_permissive_licences() -> None:
     packages = {name: p for name, p in plain_install().items() if not NVIDIA.match(name)}
-    assert {"torch", "numpy", "plyfile", "pi-heif"} <= packages.keys()
+    assert {"torch", "numpy", "pi-heif"} <= packages.keys()
     stated = {name: stated_licence(p) for name, p in packages.items()}
     copyleft = {name for name, text in stated.items() if re.search(r"GPL|General Public", text, re.IGNORECASE)}
     assert copyleft == COPYLEFT.keys()

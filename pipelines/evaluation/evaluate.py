@@ -18,9 +18,8 @@ from ..render.api import Rendering, render
 from ..sfm.lens import FramePixels
 from ..system.progress import Progress, SilentProgress, log
 from ..types import Trajectory
-from .image_quality import DepthErrorSum, open_lpips, psnr, ssim
 from .labels import ClassMap, Counts, Matching, count_labels, label_cells, match_classes
-from .mesh_error import mesh_cells
+from .metrics import DepthErrorSum, mesh_cells, open_lpips, psnr, ssim
 from .truth import (
     AbsoluteError,
     ErrorStatistics,

@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 from ..export.stage import on_earth
 from ..geometry.camera import rig_of
 from ..geometry.sparse_model import SparseModel
-from ..geometry.tape import tape_text
 from ..outcome import Outcome
-from ..run.files import PROXY_MAPS
 from ..scene.world import WORLD
-from ..types import Array, LoopEdge
+from ..types import Array, LoopEdge, Metres
 
 _ENDS = (0.01, 0.99)
 """Quantiles of the solid Gaussians between which something is: beyond are floaters, and views through windows."""
@@ -28,27 +26,22 @@ _DARK, _BRIGHT = 35.0, 225.0
 
 @dataclass(frozen=True)
 class Capture:
-    """Per picked frame: sharpness (N,) relative to the median, brightness (N,) 0..255; per posed frame of the sparse
-    model: points (F,) seen; per proxied frame: reliability (P,) mean U. ids (.,) go with each."""
+    """Per chosen frame: sharpness (N,) relative to the median, brightness (N,) 0..255; points (F,) that each posed
+    frame of the sparse model sees."""
 
     sharpness: NDArray[np.float64]
     brightness: NDArray[np.float64]
-    point_ids: NDArray[np.int64]
     points: NDArray[np.int64]
-    proxy_ids: NDArray[np.int64]
-    reliability: NDArray[np.float64]
 
 
 def read_capture(outcome: Outcome, sparse: SparseModel | None) -> Capture:
-    """Reads every frame once, and every proxy."""
+    """Read every frame once."""
     sharpness = np.array([f.sharpness for f in outcome.frames], np.float64)
     brightness = np.array([float(outcome.run.image(f)[::8, ::8].mean()) for f in outcome.frames])
-    ids = np.zeros(0, np.int64) if sparse is None else np.asarray(sparse.frame_ids, np.int64)
-    points = np.zeros(0, np.int64) if sparse is None else np.bincount(sparse.obs_frame, minlength=len(ids))
-    proxied = [f.id for f in outcome.frames if outcome.run.holds(PROXY_MAPS, of=f.id)]
-    reliability = np.array([float(outcome.run.load(PROXY_MAPS, of=i).confidence.mean()) for i in proxied])
-    relative = sharpness / max(float(np.median(sharpness)), 1e-9)
-    return Capture(relative, brightness, ids, points, np.array(proxied, np.int64), reliability)
+    points = np.zeros(0, np.int64)
+    if sparse is not None:
+        points = np.bincount(sparse.obs_frame, minlength=len(sparse.frame_ids))
+    return Capture(sharpness / max(float(np.median(sharpness)), 1e-9), brightness, points)
 
 
 @dataclass(frozen=True)
@@ -175,12 +168,6 @@ def _about_camera(outcome: Outcome) -> list[str]:
             f"The focal length is uncertain by {c.focal_sd / c.intrinsics.fx:.1%}: give it with --intrinsics if you "
             "know it, or film with more movement to the side."
         )
-    if not outcome.metric:
-        known = "Lengths have no unit" if outcome.metres is None else "Scale is estimated"
-        found.append(
-            f"{known}: one moving camera cannot observe absolute size. Give a known distance (--scale-ref) or metric "
-            "depth (--depth files or a metric network) for real metres."
-        )
     return found
 
 
@@ -195,7 +182,7 @@ def found_lengths(outcome: Outcome) -> list[tuple[str, str]]:
         rows.append(("camera height above the floor", camera_height(shown)))
     if world.axes == "up" and shown.gaussian_map is not None:
         rows += list(zip(("length", "width", "height"), extents(shown), strict=False))
-    texts = [(what, tape_text(*found, shown.metric, shown.metres)) for what, found in rows if found is not None]
+    texts = [(what, length_text(*found, shown.metric, shown.metres)) for what, found in rows if found is not None]
     return [(what if what not in ("length", "width", "height") else f"map extent, {what}", t) for what, t in texts]
 
 
@@ -243,3 +230,21 @@ def _extent(values: Array) -> tuple[float, float]:
     around = [np.quantile(values, (q - _UNSHARP, q, q + _UNSHARP)) for q in _ENDS]
     moved = [(a[2] - a[0]) / 2 for a in around]
     return float(around[1][1] - around[0][1]), float(np.hypot(*moved))
+
+
+def length_text(length: float, sd: float, is_metric: bool, metres: Metres | None) -> str:
+    """A distance in words: metres where the world has them, else units with the metres that they are guessed to be."""
+    unit_sd = metres.relative_sd if metres is not None else 0.0
+    if is_metric:
+        return f"{_with_sd(length, np.hypot(sd, unit_sd * length))} m"
+    text = f"{_with_sd(length, sd)} units"
+    if metres is None:
+        return text
+    guess = metres.per_unit * length, metres.per_unit * np.hypot(sd, unit_sd * length)
+    return f"{text} ≈ {_with_sd(*guess)} m"
+
+
+def _with_sd(value: float, sd: float) -> str:
+    """1.234 ± 0.012: two digits of the deviation, the value to the same place."""
+    digits = int(np.clip(1 - np.floor(np.log10(max(sd, 1e-6))), 0, 6))
+    return f"{value:.{digits}f} ± {sd:.{digits}f}"

@@ -1,26 +1,15 @@
-"""Pieces of a web page that needs nothing but itself: sections, tables, plots as SVG, and its print as a PDF."""
+"""Pieces of a web page that needs nothing but itself: sections, tables, plots as SVG."""
 
 from __future__ import annotations
 
 import base64
-import os
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from ...formats.atomic import atomic_path
-from ...formats.errors import InputError
-
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "microsoft-edge")
-_SECONDS = 300
 
 BLUE, ORANGE, GREY, RED, GREEN = "#2563eb", "#ea580c", "#9ca3af", "#dc2626", "#16a34a"
 
@@ -135,29 +124,17 @@ class Line:
     dashed: bool = False
 
 
-@dataclass(frozen=True)
-class Marks:
-    """points (N, 2) drawn as dots."""
-
-    points: NDArray
-    color: str
-    name: str
-    radius: float = 2.5
-
-
 def plot(
     title: str,
     x_label: str,
     y_label: str,
     lines: Sequence[Line] = (),
-    marks: Sequence[Marks] = (),
     equal: bool = False,
     width: int = 560,
     height: int = 320,
 ) -> str:
     """One SVG. `equal`: the same scale on both axes. What is not finite is left out."""
-    drawn: list[Line | Marks] = [*lines, *marks]
-    groups = [g.points[np.isfinite(g.points).all(axis=1)] for g in drawn if len(g.points)]
+    groups = [g.points[np.isfinite(g.points).all(axis=1)] for g in lines if len(g.points)]
     every = np.concatenate(groups) if groups else np.zeros((0, 2))
     if len(every) == 0:
         every = np.array([[0.0, 0.0], [1.0, 1.0]])
@@ -168,11 +145,10 @@ def plot(
         f'<text x="{frame.left}" y="16" font-size="13" font-weight="600">{escape(title)}</text>',
         _grid(frame),
         *(_line(frame, line) for line in lines),
-        *(_marks(frame, mark) for mark in marks),
         f'<text x="{(frame.left + frame.right) / 2}" y="{height - 4}" text-anchor="middle">{escape(x_label)}</text>',
         f'<text transform="translate(12 {(frame.top + frame.bottom) / 2}) rotate(-90)" text-anchor="middle">'
         f"{escape(y_label)}</text>",
-        _legend(frame, [(g.name, g.color) for g in drawn]),
+        _legend(frame, [(g.name, g.color) for g in lines]),
         "</svg>",
     ]
     return "".join(parts)
@@ -234,18 +210,11 @@ def _line(frame: _Frame, line: Line) -> str:
     path, pen_down = [], False
     for ok, (x, y) in zip(finite, placed, strict=True):
         if ok:
-            path.append(f"{'L' if pen_down else 'M'}{x:.1f} {y:.1f}")
+            path.append(f"L{x:.1f} {y:.1f}" if pen_down else f"M{x:.1f} {y:.1f}h0")  # alone it is a dot
         pen_down = bool(ok)
     dash = ' stroke-dasharray="5 4"' if line.dashed else ""
-    return f'<path d="{"".join(path)}" fill="none" stroke="{line.color}" stroke-width="1.8"{dash}/>'
-
-
-def _marks(frame: _Frame, marks: Marks) -> str:
-    finite = marks.points[np.isfinite(marks.points).all(axis=1)]
-    if len(finite) == 0:
-        return ""
-    return "".join(
-        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{marks.radius}" fill="{marks.color}"/>' for x, y in frame.place(finite)
+    return (
+        f'<path d="{"".join(path)}" fill="none" stroke="{line.color}" stroke-width="1.8" stroke-linecap="round"{dash}/>'
     )
 
 
@@ -258,29 +227,3 @@ def _legend(frame: _Frame, names: Sequence[tuple[str, str]]) -> str:
         parts.append(f'<text x="{x + 16}" y="31" fill="#374151">{escape(name)}</text>')
         x += 30 + 6.2 * len(name)
     return "".join(parts)
-
-
-def find_browser() -> str:
-    """The browser to print with. Raises InputError where there is none."""
-    for name in BROWSERS:
-        if found := shutil.which(name):
-            return found
-    raise InputError(
-        "a PDF needs a browser of the Chromium family, and none is in the PATH: install chromium, or open the HTML "
-        "report in any browser and print it there"
-    )
-
-
-def print_pdf(page: Path, target: Path, browser: str) -> None:
-    """Print an HTML file. Raises InputError with the browser's own words where it cannot."""
-    with atomic_path(target) as temporary, tempfile.TemporaryDirectory() as profile:
-        command = [browser, "--headless=new", "--disable-gpu", "--no-first-run", "--no-pdf-header-footer"]
-        command += ["--no-sandbox"] if os.geteuid() == 0 else []  # it does not start as root with one
-        command += [f"--user-data-dir={profile}", f"--print-to-pdf={temporary}", page.resolve().as_uri()]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=_SECONDS)
-        except subprocess.TimeoutExpired as error:
-            raise InputError(f"{browser} took over {_SECONDS} s to print {page}: open it and print it there") from error
-        if done.returncode or not temporary.exists():
-            said = done.stderr.strip()[-300:]
-            raise InputError(f"{browser} could not print {page} ({said}): open it and print it there")

@@ -32,12 +32,10 @@ from ..types import VOID, LoopEdge
 from .facts import Capture, advice, found_lengths, lost_stretches, read_capture
 from .html import (
     BLUE,
-    GREEN,
     GREY,
     ORANGE,
     RED,
     Line,
-    Marks,
     bullets,
     chips,
     drawing,
@@ -45,11 +43,10 @@ from .html import (
     legend,
     page,
     plot,
-    print_pdf,
     section,
     table,
 )
-from .image_quality import psnr
+from .metrics import psnr
 from .views import depth_picture, depth_range, labels_on_photo, mesh_picture, render_outcome
 from .write import (
     JUDGED,
@@ -72,22 +69,17 @@ def write_report(
     run: RunFolder,
     path: Path | None = None,
     progress: Progress | None = None,
-    browser: str = "",
     overwrite: bool = False,
 ) -> Path:
     """Write RUN/report.html, or `path`; returns where. What has not been done yet is left out.
 
-    browser: one that prints a PDF of it beside it, "" = none; overwrite: whether a file at `path` that is no earlier
-    report may be replaced. Raises InputError for a run without poses, or such a file.
+    overwrite: whether a file at `path` that is no earlier report may be replaced. Raises InputError for a run without
+    poses, or such a file.
     """
     outcome, target = load_outcome(run), path or run.report_file
-    names = {target.name, target.with_suffix(".pdf").name} if browser else {target.name}
     place = Target(target.parent, overwrite or path is None)
-    with place.replacing(names.__contains__) as staged:
-        html = staged / target.name
-        write_text(html, _report(outcome, target, progress or SilentProgress()))
-        if browser:
-            print_pdf(html, html.with_suffix(".pdf"), browser)
+    with place.replacing(target.name.__eq__) as staged:
+        write_text(staged / target.name, _report(outcome, target, progress or SilentProgress()))
     return target
 
 
@@ -269,8 +261,8 @@ def truth_section(evaluation: dict[str, Any], outcome: Outcome) -> str:
         per_unit, unit = (100.0, "cm") if evaluation["unit"] == "m" else (1.0, evaluation["unit"])
         points = np.stack([errors[:, 0], per_unit * errors[:, 1]], axis=1)
         drawn = plot("Distance from the true camera", "frame", unit, [Line(points, RED, "")])
-    beside = run.evaluation_file.with_name(PATH_FROM_ABOVE)
-    drawn += drawing(read_bytes(beside), "The camera path from above") if beside.exists() else ""
+    svg = run.evaluation_file.with_name(PATH_FROM_ABOVE)
+    drawn += drawing(read_bytes(svg), "The camera path from above") if svg.exists() else ""
     return section(
         f"Compared with ground truth: {evaluation['truth']}",
         f'<div class="two">{drawn}</div>',
@@ -375,8 +367,8 @@ def _depth_scale(nearest: float, farthest: float, unit: str) -> str:
     colors = ",".join("rgb({},{},{})".format(*c) for c in depth_picture(depths[None], nearest, farthest)[0].tolist())
     low, middle, high = (f"{depths[k]:.2g}" for k in (0, 4, 8))
     bar = f'<i style="background:linear-gradient(to right,{colors})"></i>'
-    told = f"depth, {escape(unit)}: {low} {bar} {high} <span>({middle} in the middle)</span>"
-    return f'<div class="legend scale">{told}</div>'
+    middle = f"<span>({middle} in the middle)</span>"
+    return f'<div class="legend scale">depth, {escape(unit)}: {low} {bar} {high} {middle}</div>'
 
 
 def _reach(outcome: Outcome, ids: list[int]) -> tuple[float, float]:
@@ -394,9 +386,6 @@ def quality_section(outcome: Outcome, capture: Capture, views: RenderedViews | N
         series.append(("PSNR of keyframes", "dB", np.array(views.ids), np.array(views.psnr), BLUE))
     series.append(("Sharpness relative to the median", "", ids, capture.sharpness, ORANGE))
     series.append(("Mean brightness", "0..255", ids, capture.brightness, GREY))
-    order = np.argsort(capture.point_ids)
-    series.append(("Points visible", "", capture.point_ids[order], capture.points[order], GREEN))
-    series.append(("Mean reliability U of the proxy depth", "0..1", capture.proxy_ids, capture.reliability, RED))
     return section(
         "Quality over time",
         '<div class="two">',
@@ -407,8 +396,7 @@ def quality_section(outcome: Outcome, capture: Capture, views: RenderedViews | N
 
 def _over_frames(name: str, unit: str, ids: NDArray, values: NDArray, color: str) -> str:
     points = np.stack([ids.astype(np.float64), np.asarray(values, np.float64)], axis=1)
-    marks = [Marks(points, color, "", 1.8)] if len(points) < 150 else []
-    return plot(name, "frame", unit, [Line(points, color, "")], marks, height=240)
+    return plot(name, "frame", unit, [Line(points, color, "")], height=240)
 
 
 def class_legend(outcome: Outcome, views: RenderedViews) -> str:

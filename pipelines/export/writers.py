@@ -12,10 +12,10 @@ from ...formats.atomic import write_text
 from ...formats.colmap import ColmapModel, write_colmap_model
 from ...formats.datasets.nerfstudio import write_transforms
 from ...formats.gaussians import GaussianCloud
+from ...formats.glb import write_gaussian_glb
 from ...formats.mesh import has_texture
 from ...formats.ply import write_gaussian_ply, write_point_ply
 from ...formats.sog import write_sog
-from ...formats.splats import write_gaussian_glb
 from ...formats.spz import write_spz
 from ...formats.trajectory import write_tum
 from ..geometry.camera import rig_of

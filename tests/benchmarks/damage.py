@@ -12,7 +12,6 @@ code 1 if any is wrong.
 
 import argparse
 import collections
-import hashlib
 import json
 import re
 import shutil
@@ -21,16 +20,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import click
-import numpy as np
 from click.testing import CliRunner, Result
 
 from msgs_slam.formats.reading import file_sha256
 from msgs_slam.msgs_cli.main import main as msgs_slam
 from msgs_slam.pipelines.config import STAGES
+from msgs_slam.pipelines.evaluation.serve import PageServer
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.viewer.server import Viewer
 
-PORT = 18097
 Damage = Callable[[Path, Path], None]
 
 
@@ -67,25 +64,18 @@ def commands(run: Path, truth: Path, out: Path) -> dict[str, list[str]]:
         "report": ["report", str(run), "--to", str(out / "report.html"), "-q"],
         "evaluate": ["evaluate", str(run), "--truth", str(truth), "-q"],
         "render": ["render", str(run), str(out), "--fps", "1", "-q"],
-        "view": ["view", str(run), "--port", str(PORT)],
+        "view": ["view", str(run)],
     }
 
 
-def look_at_all(viewer: Viewer, out: Path) -> None:
-    """In place of waiting: click every camera, and write what is shown into `out`; then Ctrl-C."""
-    scene, digest = viewer.scene, hashlib.sha256()
-    shown = [scene.centers, scene.covariances, scene.opacities, scene.path, *scene.colors.values()]
-    if scene.mesh_file is not None:
-        shown.append(np.fromfile(scene.mesh_file, np.uint8))
-    for camera in scene.cameras:
-        viewer.visit(camera, None)
-        if "msgs-slam" in viewer.preview.label:
-            click.echo(viewer.preview.label)
-        shown += [camera.world_from_cam, viewer.preview.image]
-    for array in shown:
-        digest.update(np.ascontiguousarray(array).tobytes())
+def look_at_all(server: PageServer, out: Path) -> None:
+    """In place of serving: write the pages into `out`; then Ctrl-C."""
     out.mkdir(parents=True)
-    (out / "shown.txt").write_text(digest.hexdigest())
+    for part in server.parts():
+        page = server.page(part)
+        if "<canvas" not in page:
+            click.echo(page)
+        (out / f"{part}.html").write_text(page)
     raise KeyboardInterrupt
 
 
@@ -157,7 +147,7 @@ def main() -> None:
     parser.add_argument("--series", type=int, default=2)
     options = parser.parse_args()
     damaged, out = options.work / "damaged.msgs", options.work / "out"
-    Viewer.wait = lambda viewer: look_at_all(viewer, out)  # type: ignore[method-assign]
+    PageServer.serve_forever = lambda server: look_at_all(server, out)  # type: ignore[method-assign, assignment]
     counts: collections.Counter[str] = collections.Counter()
     whole: dict[str, dict[str, str]] = {}
     files = chosen_files(options.run, options.series)

@@ -101,21 +101,15 @@ def page(run: RunFolder, target: Path, scratch: Path) -> None:
 
 
 def viewer(run: RunFolder, target: Path, scratch: Path) -> None:
-    """The viewer in colour and by class, side by side."""
-    from msgs_slam.pipelines.viewer.server import open_viewer
-
-    opened, halves = open_viewer(run.root, port=0), []
-    try:
-        with browser(scratch / "profile", (1050, 620)) as tab:
-            show(tab, opened.url, 12)
-            tab.value("[...document.querySelectorAll('.mantine-Notification-closeButton')].forEach(b => b.click())")
-            for mode in ("colour", "classes"):
-                opened.mode.value = mode
-                time.sleep(10)
-                tab.screenshot(scratch / f"{mode}.png")
-                halves.append(cv2.imread(str(scratch / f"{mode}.png")))
-    finally:
-        opened.stop()
+    """The map's page in colour and by class, side by side."""
+    halves = []
+    with browser(scratch / "profile", (1050, 620)) as tab:
+        show(tab, run.path("export", "map.html").resolve().as_uri(), 8)
+        for words in ("Colour", "Classes"):
+            tab.press(words)
+            time.sleep(5)
+            tab.screenshot(scratch / f"{words}.png")
+            halves.append(cv2.imread(str(scratch / f"{words}.png")))
     cv2.imwrite(str(target / "viewer.jpg"), at_width(np.concatenate(halves, axis=1), 1400), QUALITY)
 
 

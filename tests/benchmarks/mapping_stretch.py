@@ -31,8 +31,8 @@ from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.depth.align import fit_fields
 from msgs_slam.pipelines.depth.fields import FINE, field_scales
-from msgs_slam.pipelines.evaluation.image_quality import DepthErrorSum, psnr, ssim
 from msgs_slam.pipelines.evaluation.labels import count_labels, score
+from msgs_slam.pipelines.evaluation.metrics import DepthErrorSum, psnr, ssim
 from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.mapping.optimise import optimise_map
 from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes, without_contradicted_depth

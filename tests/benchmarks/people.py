@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from msgs_slam.formats.images import read_depth_png, read_rgb, write_grey_png, write_rgb
-from msgs_slam.pipelines.evaluation.image_quality import psnr
+from msgs_slam.pipelines.evaluation.metrics import psnr
 from msgs_slam.pipelines.evaluation.views import render_outcome
 from msgs_slam.pipelines.geometry.camera import project, unproject_depth
 from msgs_slam.pipelines.geometry.se3 import Similarity, align_points

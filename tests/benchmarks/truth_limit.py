@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.pipelines.evaluation.evaluate import trajectory_cells
-from msgs_slam.pipelines.evaluation.mesh_error import SurfaceError, surface_error, true_surface
+from msgs_slam.pipelines.evaluation.metrics import SurfaceError, surface_error, true_surface
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.outcome import load_outcome

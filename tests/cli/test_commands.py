@@ -268,8 +268,7 @@ def test_export_with_other_settings_must_say_where_to(tmp_path: Path) -> None:
         (("export", "--to", "x", "--set", "mapping.passes=3"), "msgs-slam resume no.msgs --set mapping.passes=3"),
         (("export", "--to", ""), "the name is empty; the working folder is ."),
         (("reconstruct", "--out", ""), "the name is empty; the working folder is ."),
-        (("report", "--to", "report.pdf"), "report.html; with --pdf"),
-        (("report", "--to", "report.PDF", "--pdf"), "report.html; with --pdf"),
+        (("report", "--to", "report.pdf"), "report.html; print it in a browser"),
     ],
 )
 def test_options_that_would_do_nothing_or_something_else_are_refused(words: tuple[str, ...], reason: str) -> None:

@@ -9,9 +9,9 @@ from cli_runs import invoke
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.msgs_cli.output import format_table
+from msgs_slam.pipelines.evaluation.serve import page_of_run
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
 from msgs_slam.pipelines.system.wording import figure_text, lost_text, stretches
-from msgs_slam.pipelines.viewer.scene import load_scenes
 
 USED_BY = {
     "frames/frames.json": "ply",
@@ -54,13 +54,13 @@ def test_damage_is_named_and_never_used(how: str, copied_run: Callable[[str], Pa
     assert invoke("export", run, "--only", "tum", "--to", tmp_path / "out", "-q").exit_code == 0
 
 
-def test_a_damaged_mesh_is_not_shown(copied_run: Callable[[str], Path]) -> None:
+def test_a_damaged_page_is_not_shown(copied_run: Callable[[str], Path]) -> None:
     run = copied_run("run.msgs")
-    assert load_scenes(run)[0].mesh_file == run / "export" / "mesh.glb"
+    assert page_of_run(RunFolder(run)) == (run / "export" / "map.html").read_text()
     for how in ("flipped", "cut", "deleted"):
-        spoil(run / "export" / "mesh.glb", how)
-        with pytest.raises(InputError, match=r"mesh\.glb is .*msgs-slam resume"):
-            load_scenes(run)
+        spoil(run / "export" / "map.html", how)
+        with pytest.raises(InputError, match=r"map\.html is .*msgs-slam resume"):
+            page_of_run(RunFolder(run))
 
 
 def test_damaged_export_is_made_again(copied_run: Callable[[str], Path]) -> None:

@@ -59,13 +59,11 @@ def test_commands_install_beside_this_program(has_pip: bool, words: str, monkeyp
     """Whatever environment the shell is in; `uv tool` makes some without pip."""
     monkeypatch.setattr(sys, "executable", "/opt/my tools/bin/python")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if has_pip else None)
-    command = install_command(".[viewer]", "torch<3")
+    command = install_command(".[hdr]", "torch<3")
     assert words in command
     split = shlex.split(command)
     assert "/opt/my tools/bin/python" in split
-    assert split[-2:] == [".[viewer]", "torch<3"]
-    viewer = found("viewer", Path("."))
-    assert viewer.fix in ("", install_extra("viewer"))
+    assert split[-2:] == [".[hdr]", "torch<3"]
     assert shlex.split(install_extra("hdr"))[-1] == "av>=14"
     assert "msgs-slam" not in install_extra("cluster")
 
@@ -78,7 +76,7 @@ def test_a_check_that_breaks_is_a_finding(tmp_path: Path, monkeypatch: pytest.Mo
     finding = found("video", tmp_path)
     assert finding.state == BAD
     assert "no such bus" in finding.text
-    assert found("viewer", tmp_path).state in (GOOD, NOTE)
+    assert found("threads", tmp_path).state in (GOOD, NOTE)
 
 
 @pytest.mark.parametrize(("built", "fix"), [(None, "install a CUDA build of torch"), ("12.6", "update the driver")])

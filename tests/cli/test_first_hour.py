@@ -1,5 +1,6 @@
 """What somebody types in the first hour works, as the tour's commands do, or the message says what was meant."""
 
+import json
 import os
 import re
 import shlex
@@ -12,14 +13,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 from cli_runs import FinishedRun, invoke
 
 from msgs_slam.formats.datasets import FORMATS
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.config import RunConfig
-from msgs_slam.pipelines.viewer.camera_path import CameraPath, Keyframe
 
 COMMAND = [sys.executable, "-m", "msgs_slam"]
 
@@ -158,9 +157,9 @@ MADE_ELSEWHERE = {"reconstruct", "resume", "demo", "view", "doctor", "models"}
 def test_the_tour_can_be_followed(finished_run: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(finished_run.folder, tmp_path / "video.msgs")
     (tmp_path / "DATASET").symlink_to(finished_run.truth)
-    shutil.copyfile(finished_run.folder / "export" / "point_cloud.ply", tmp_path / "scene.ply")
-    start, end = (Keyframe(np.eye(4), 60.0) for _ in range(2))
-    (tmp_path / "video-path.json").write_text(CameraPath((start, end), seconds_per_keyframe=0.2).to_json())
+    keyframe = {"position": [0, 0, 0], "rotation_wxyz": [1, 0, 0, 0], "fov_degrees": 60}
+    path = {"format": "msgs-slam camera path 1", "world": "exported", "fps": 30, "seconds_per_keyframe": 0.2}
+    (tmp_path / "video-path.json").write_text(json.dumps(path | {"keyframes": [keyframe, keyframe]}))
     monkeypatch.chdir(tmp_path)
     lines = re.findall(r"^msgs-slam (.*)$", TOUR.read_text(encoding="utf-8"), flags=re.MULTILINE)
     followed = [words for line in lines if (words := shlex.split(line, comments=True))[0] not in MADE_ELSEWHERE]

@@ -48,10 +48,7 @@ from msgs_slam.formats.images import (
     write_rgb,
 )
 from msgs_slam.formats.mesh import MeshArrays, MeshBlocks, read_mesh_ply, write_mesh_ply
-from msgs_slam.formats.ply import write_gaussian_ply
 from msgs_slam.formats.poses import read_poses
-from msgs_slam.formats.splats import read_gaussians, write_gaussian_glb
-from msgs_slam.formats.spz import write_spz
 from msgs_slam.formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
 from msgs_slam.formats.textfile import read_toml, write_json
 from msgs_slam.formats.trajectory import read_matrices, read_tum, write_tum
@@ -67,7 +64,6 @@ from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.networks.words import load_linear_head, load_word_head, open_tokenizer, with_words
 from msgs_slam.pipelines.source.given import read_intrinsics
 from msgs_slam.pipelines.source.recording import open_recording
-from msgs_slam.pipelines.viewer.scene import load_scenes
 from tests.clouds import random_cloud
 from tests.colmap_models import posed_images
 from tests.matrices import random_poses, write_matrices
@@ -131,21 +127,6 @@ def colmap_model(folder: Path) -> None:
     need(all(c[1] > 0 and c[2] > 0 for c in model.cameras), "a camera without a size")
     need(len(set(model.names)) == len(model.names), "a name twice")
     need((model.obs_point < len(model.points)).all(), "a point that is not there")
-
-
-def gaussians(path: Path) -> None:
-    cloud = read_gaussians(path)
-    for name in ("means", "log_scales", "quat_wxyz", "opacity_logits", "colors"):
-        finite(getattr(cloud, name), name)
-    need(np.abs(np.linalg.norm(cloud.quat_wxyz, axis=1) - 1).max(initial=0) < 1e-3, "no unit quaternion")
-    if cloud.class_probs is not None:
-        finite(cloud.class_probs, "class_probs")
-
-
-def viewer_scene(path: Path) -> None:
-    (scene,) = load_scenes(path)
-    finite(scene.centers, "centers")
-    finite(scene.covariances, "covariances")
 
 
 def mesh(read: Callable[[Path], MeshArrays]) -> Callable[[Path], None]:
@@ -319,11 +300,6 @@ def make_colmap(suffix: str) -> Callable[[Path], None]:
     return make
 
 
-def make_splat(folder: Path) -> None:
-    rows = np.ones(10, dtype=[("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
-    (folder / "a.splat").write_bytes(rows.tobytes())
-
-
 register_heif_opener()  # to write HEIC, which the program only reads
 
 
@@ -492,14 +468,6 @@ JSON_HEAD = with_json_head(0)
 DOORS: dict[str, Door] = {
     "COLMAP, binary": Door(make_colmap(".bin"), colmap_model, weight=2),
     "COLMAP, text": Door(make_colmap(".txt"), colmap_model, weight=2),
-    "Gaussian PLY": Door(lambda f: write_gaussian_ply(f / "a.ply", _cloud(), ("a", "b")), gaussians, "a.ply", weight=2),
-    "viewer's scene": Door(lambda f: write_gaussian_ply(f / "a.ply", _cloud()), viewer_scene, "a.ply"),
-    "SPZ": Door(lambda f: write_spz(f / "a.spz", _cloud()), gaussians, "a.spz"),
-    "SPZ, version 3": Door(lambda f: write_spz(f / "a.spz", _cloud(), version=3), gaussians, "a.spz"),
-    ".splat": Door(make_splat, gaussians, "a.splat"),
-    "Gaussian GLB": Door(
-        lambda f: write_gaussian_glb(f / "a.glb", _cloud()), gaussians, "a.glb", with_json_head(12)
-    ),
     "class map": Door(text("a.toml", CLASS_MAP), read_class_map, "a.toml"),
     "masks": Door(make_masks, masks, damaged="0.png"),
     "mesh PLY": Door(lambda f: write_mesh_ply(f / "a.ply", _mesh()), mesh(read_mesh_ply), "a.ply", in_ply),

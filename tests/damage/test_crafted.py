@@ -1,7 +1,6 @@
 """Files and names made to break readers, one by one: refused with words, at once and in little memory."""
 
 import contextlib
-import gzip
 import io
 import itertools
 import json
@@ -30,9 +29,8 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gps import read_track
 from msgs_slam.formats.image_folder import read_image_times
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.formats.mesh import read_mesh_ply, read_textured_glb
 from msgs_slam.formats.poses import read_poses
-from msgs_slam.formats.splats import read_gaussians
 from msgs_slam.formats.tensors import load_arrays, load_tensors
 from msgs_slam.formats.textfile import read_json, read_toml
 from msgs_slam.formats.trajectory import read_matrices, read_tum
@@ -45,10 +43,6 @@ DEEP = 100_000
 
 def ply(head: bytes, body: bytes = b"", form: bytes = b"binary_little_endian") -> bytes:
     return b"ply\nformat " + form + b" 1.0\n" + head + b"end_header\n" + body
-
-
-def spz(count: int, body: bytes, fraction_bits: int = 12) -> bytes:
-    return gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 2, count, 0, fraction_bits, 0, 0) + body, 9, mtime=0)
 
 
 def npz_bomb() -> bytes:
@@ -70,8 +64,6 @@ def glb(header: dict[str, Any]) -> bytes:
     return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text), len(text), 0x4E4F534A) + text
 
 
-MESH = b"element vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\n"
-TRIANGLE = b"0 0 0\n1 0 0\n0 1 0\n"
 BAD_FILES: dict[str, tuple[str, bytes, Read]] = {
     "JSON of a hundred thousand levels": ("a.json", b'{"a":' * DEEP + b"1" + b"}" * DEEP, read_json),
     "list of a hundred thousand levels": ("a.json", b"[" * DEEP + b"]" * DEEP, read_json),
@@ -85,25 +77,21 @@ BAD_FILES: dict[str, tuple[str, bytes, Read]] = {
     "inline key of many parts": ("a.toml", b"x = {" + b".".join([b"a"] * DEEP) + b" = 1}", read_toml),
     "TOML number of 5000 digits": ("a.toml", b"a = " + b"1" * 5000, read_toml),
     "date that is none": ("a.toml", b"a = 2024-02-31", read_toml),
-    "PLY of rows without columns": ("a.ply", ply(b"element vertex 1000000000000\n"), read_gaussians),
+    "PLY of a million million rows": ("a.ply", ply(b"element vertex 1000000000000\nelement face 0\n"), read_mesh_ply),
     "face that points far outside": (
         "a.ply",
-        ply(MESH + b"property list uchar int vertex_indices\n", TRIANGLE + b"3 0 1 2147483647\n", b"ascii"),
-        read_mesh_ply,
-    ),
-    "face of 2^32 - 1": (
-        "a.ply",
-        ply(MESH + b"property list uchar uint vertex_indices\n", bytes(36) + b"\3" + b"\xff" * 12),
+        ply(b"element vertex 3\nelement face 1\n", bytes(3 * 16) + b"\3" + b"\xff\xff\xff\x7f" * 3),
         read_mesh_ply,
     ),
     "vertex that is no number": (
-        "a.ply", ply(MESH + b"property list uchar int vertex_indices\n", b"nan 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", b"ascii"),
-        read_mesh_ply,
+        "a.ply", ply(b"element vertex 1\nelement face 0\n", b"\xff" * 16), read_mesh_ply,
     ),
-    "GLB of a billion zeros": ("a.glb", glb({"asset": {}, "accessors": [{"count": 10**9}]}), read_gaussians),
-    "GLB that names another file": ("a.glb", glb({"asset": {}, "buffers": [{"uri": "/etc/passwd"}]}), read_gaussians),
-    "SPZ bomb": ("a.spz", spz(10_000_000, bytes(190_000_000)), read_gaussians),
-    "SPZ of 255 fraction bits": ("a.spz", spz(2, b"\x55" * 38, 255), read_gaussians),
+    "GLB of a billion zeros": (
+        "a.glb", glb({"textures": [], "bufferViews": 5 * [{"byteOffset": 0, "byteLength": 10**9}]}), read_textured_glb,
+    ),
+    "GLB that names another file": (
+        "a.glb", glb({"textures": [], "buffers": [{"uri": "/etc/passwd"}]}), read_textured_glb,
+    ),
     "npz bomb": ("a.npz", npz_bomb(), load_arrays),
     "safetensors header of 2^62 bytes": ("a.safetensors", struct.pack("<Q", 1 << 62) + b"{}", load_tensors),
     "quaternion of length 3": ("a.txt", b"0 0 0 0 0 0 0 3\n", read_tum),
@@ -188,7 +176,7 @@ PARSERS: dict[str, tuple[str, Read]] = {
     "TOML": ("a.toml", read_toml),
     "transforms": ("transforms.json", open_sequence),
     "times": ("times.txt", lambda p: read_image_times([p.parent / "1.png"])),
-    "PLY": ("a.ply", read_gaussians),
+    "PLY": ("a.ply", read_mesh_ply),
     "list of videos": ("a.videos", video_files),
 }
 

@@ -1,4 +1,4 @@
-"""Gaussian splat files: the reference layout to the byte, and foreign files."""
+"""Gaussian splat files: the reference layout to the byte, read again by plyfile."""
 
 import time
 from pathlib import Path
@@ -7,9 +7,9 @@ import numpy as np
 import plyfile
 import pytest
 
-from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.gaussians import GaussianCloud, isotropic_cloud
-from msgs_slam.formats.ply import SH_C0, read_gaussian_ply, write_gaussian_ply
+from msgs_slam.formats.ply import SH_C0, write_gaussian_ply
+from tests.splat_readers import read_gaussian_ply
 
 
 def _cloud(m: int = 300, classes: int = 7) -> GaussianCloud:
@@ -68,37 +68,6 @@ def test_round_trip(tmp_path: Path, sh_degree: int) -> None:
     for field in ("means", "log_scales", "quat_wxyz", "opacity_logits", "class_ids", "class_probs"):
         assert (getattr(back, field) == getattr(cloud, field)).all(), field
     np.testing.assert_allclose(back.colors, cloud.colors, atol=3e-7)
-
-
-def test_a_file_by_the_original_program(shared_data: Path) -> None:
-    path = shared_data / "format_cases" / "ply_other_writers" / "test-splat.3-points-from-train.ply"
-    cloud, raw = read_gaussian_ply(path), plyfile.PlyData.read(str(path))["vertex"]
-    assert (len(cloud), cloud.class_ids, cloud.class_probs) == (3, None, None)
-    np.testing.assert_allclose(np.linalg.norm(cloud.quat_wxyz, axis=1), 1, atol=1e-6)
-    np.testing.assert_array_equal(cloud.log_scales[:, 1], raw["scale_1"])
-    np.testing.assert_allclose(cloud.colors[:, 2], 0.5 + 0.28209479 * raw["f_dc_2"], atol=1e-6)
-
-
-def test_other_files_are_explained(shared_data: Path, tmp_path: Path) -> None:
-    cases = shared_data / "format_cases"
-    for path, message in [
-        (cases / "lfs_pointer" / "point_cloud.ply", "git lfs pull"),
-        (cases / "ply_other_writers" / "beetle.binary.ply", "a mesh, not"),
-        (cases / "ply_other_writers" / "inria_3dgs_output" / "input.ply", "a point cloud, not"),
-        (cases / "ply_other_writers" / "test-splat.3-points-from-train.spz", "no PLY file"),
-        (cases / "none.ply", "no such file"),
-    ]:
-        with pytest.raises(InputError, match=message):
-            read_gaussian_ply(path)
-    write_gaussian_ply(tmp_path / "whole.ply", _cloud())
-    data = (tmp_path / "whole.ply").read_bytes()
-    for keep in (1, 100, len(data) // 2, len(data) - 1):
-        (tmp_path / "cut.ply").write_bytes(data[:keep])
-        with pytest.raises(InputError):
-            read_gaussian_ply(tmp_path / "cut.ply")
-    (tmp_path / "huge.ply").write_bytes(data.replace(b"vertex 300", b"vertex 99999999999"))
-    with pytest.raises(InputError, match="not copied completely"):
-        read_gaussian_ply(tmp_path / "huge.ply")
 
 
 def test_a_long_class_table_costs_only_the_classes_that_occur(tmp_path: Path) -> None:

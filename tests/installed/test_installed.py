@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -149,28 +148,20 @@ def test_each_export_alone(demo: Path, kind: str, tmp_path: Path) -> None:
     assert (tmp_path / kind / FILES[kind]).stat().st_size > 0
 
 
-@pytest.fixture
-def port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        number = probe.getsockname()[1]
-    return number
-
-
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
-def test_the_viewer_shows_a_page_and_ends(demo: Path, port: int, stop: signal.Signals, tmp_path: Path) -> None:
-    pytest.importorskip("viser")
+def test_view_shows_a_page_and_ends(demo: Path, stop: signal.Signals, tmp_path: Path) -> None:
     said = tmp_path / "said.txt"
     with said.open("w") as stream:
         viewer = subprocess.Popen(
-            [str(PROGRAM), "view", str(demo), "--port", str(port)], cwd=tmp_path, env=environment(),
+            [str(PROGRAM), "view", str(demo)], cwd=tmp_path, env=environment(),
             stdout=stream, stderr=stream,
         )  # fmt: skip
     try:
         while not (found := re.search(r"open (http://\S+)", said.read_text())):
             assert viewer.poll() is None, said.read_text()[-2000:]
             time.sleep(0.2)
-        assert b"<html" in urllib.request.urlopen(found[1], timeout=30).read().lower()
+        assert b"<iframe" in urllib.request.urlopen(found[1], timeout=30).read()
+        assert b"<canvas" in urllib.request.urlopen(f"{found[1]}map", timeout=60).read()
         viewer.send_signal(stop)
         assert viewer.wait(timeout=60) == 0
         assert "Traceback" not in said.read_text()

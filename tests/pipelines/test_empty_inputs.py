@@ -19,10 +19,10 @@ from msgs_slam.pipelines.depth.align import (
     scale_at_points,
 )
 from msgs_slam.pipelines.depth.fields import contradicted
-from msgs_slam.pipelines.evaluation.html import Line, Marks, plot
-from msgs_slam.pipelines.evaluation.image_quality import DepthError, DepthErrorSum
+from msgs_slam.pipelines.evaluation.film import orbit, resampled, smoothed
+from msgs_slam.pipelines.evaluation.html import Line, plot
 from msgs_slam.pipelines.evaluation.labels import matched_one_to_one, score
-from msgs_slam.pipelines.evaluation.mesh_error import depth_points, seen_in_depth, thinned
+from msgs_slam.pipelines.evaluation.metrics import DepthError, DepthErrorSum, depth_points, seen_in_depth, thinned
 from msgs_slam.pipelines.evaluation.truth import associate
 from msgs_slam.pipelines.evaluation.views import depth_picture, depth_range, view_map
 from msgs_slam.pipelines.export.extra.atlas import simplified
@@ -51,7 +51,6 @@ from msgs_slam.pipelines.scene.metres import Seen, contradiction, usual_evidence
 from msgs_slam.pipelines.scene.upright import cameras_up, line_planes, up_of_lines
 from msgs_slam.pipelines.scene.view import SeenFrame, build_scene
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
-from msgs_slam.pipelines.viewer.render_run import orbit, resampled, smoothed
 
 UP = np.array([0.0, -1, 0])
 EYE = np.eye(4)
@@ -197,7 +196,7 @@ def few_others() -> Iterator[Any]:
     yield lambda: (occurring_classes([]), thinned(np.empty((0, 3)), 0.1))
     yield lambda: list(joined(lambda: iter(())).vertices())
     for points in (np.empty((0, 2)), np.zeros((1, 2)), np.full((2, 2), np.nan)):
-        yield lambda p=points: plot("t", "x", "y", [Line(p, "#000", "a")], [Marks(p, "#000", "b")], equal=True)
+        yield lambda p=points: plot("t", "x", "y", [Line(p, "#000", "a")], equal=True)
     for count in (0, 1):
         z = torch.zeros
         few = GaussianMap(z(count, 3) - 1, z(count), z(count), z(count, 3), z(count, 2), z(count, dtype=torch.int64))

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ....formats.atomic import require_room
 from ....formats.gaussians import GaussianCloud, isotropic_cloud
+from ....formats.glb import COMPRESSION, EXTENSION, write_compressed_glb
 from ....formats.gps import ecef_from_enu
-from ....formats.splats import COMPRESSION, EXTENSION, write_compressed_glb
 from ....formats.textfile import write_json
 from ...outcome import Outcome
 from ...scene.world import Z_UP_FROM_Y_DOWN, World

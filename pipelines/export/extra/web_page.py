@@ -21,7 +21,7 @@ from ....formats.sog import morton_order
 from ...geometry.camera import rig_of
 from ...outcome import Outcome, map_cloud, spread_sample
 from ...run.folder import RunFolder
-from ...scene.world import Z_UP_FROM_Y_DOWN, World
+from ...scene.world import SAME, Z_UP_FROM_Y_DOWN, World
 from ...types import VOID
 
 WEB_PAGE = "map.html"
@@ -30,22 +30,38 @@ MAX_GAUSSIANS = 1_500_000
 _MIN_BYTES = 10
 """A Gaussian's in the page; 12 in the rooms measured."""
 MAX_CAMERAS = 120
-_PARTS = Path(__file__).parent / "page"
-_SCRIPTS = ("cloud.js", "draw.js", "moves.js", "tape.js", "page.js")
+EXPORTED, RUN = "exported", "run"
+"""Worlds of a camera path: that of the exported files, and that of a run without an export."""
+PARTS = Path(__file__).parent / "page"
+_SCRIPTS = ("cloud.js", "draw.js", "moves.js", "tape.js", "record.js", "page.js")
 
 
 def write_web_page(outcome: Outcome, world: World, folder: Path) -> list[Path]:
-    """map.html; nothing where there are no Gaussians. `outcome` is in `world`. Raises DiskFullError before it is made
-    where there is no room for it."""
+    """Write map.html; nothing where there are no Gaussians. `outcome` is in `world`. Raises DiskFullError before it is
+    made where there is no room for it."""
     require_room(folder / WEB_PAGE, _MIN_BYTES * min(len(outcome.require_map()), MAX_GAUSSIANS))
-    cloud = map_cloud(outcome)
-    if len(cloud) == 0:
+    if len(outcome.require_map()) == 0:
         return []
+    write_text(folder / WEB_PAGE, page_of(outcome, world))
+    return [folder / WEB_PAGE]
+
+
+def page_of(outcome: Outcome, world: World, is_exported: bool = True, elements: str = "Gaussians") -> str:
+    """Return the page of a map that is in `world` and holds one Gaussian at least.
+
+    is_exported: camera paths are recorded in the coordinates of the exported files, else in the run's own; elements:
+    what the page calls the Gaussians.
+    """
+    cloud = map_cloud(outcome)
     upright = np.eye(3) if world.axes == "up" else Z_UP_FROM_Y_DOWN
+    back = SAME if is_exported else world.exported_from_run.inverse()
     about, packed = pack_cloud(cloud, upright)
     about |= _classes(cloud, outcome) | _cameras(outcome, upright) | _unit(outcome, world)
-    write_text(folder / WEB_PAGE, _page(_title(outcome.run), about, packed))
-    return [folder / WEB_PAGE]
+    about |= {"elements": elements, "recorded": {
+        "world": EXPORTED if is_exported else RUN,
+        "turn": (back.rotation @ upright.T).ravel().tolist(), "shift": back.translation.tolist(),
+    }}  # fmt: skip
+    return _page(_title(outcome.run), about, packed)
 
 
 def pack_cloud(cloud: GaussianCloud, upright: NDArray[np.float64]) -> tuple[dict[str, Any], bytes]:
@@ -140,10 +156,10 @@ def _title(run: RunFolder) -> str:
 def _page(title: str, about: dict[str, Any], packed: bytes) -> str:
     parts = {
         "title": escape(title),
-        "style": (_PARTS / "style.css").read_text(encoding="utf-8"),
+        "style": (PARTS / "style.css").read_text(encoding="utf-8"),
         "about": json.dumps(about, separators=(",", ":")).replace("<", "\\u003c"),
         "map": base64.b64encode(packed).decode("ascii"),
-        "script": "\n".join((_PARTS / name).read_text(encoding="utf-8") for name in _SCRIPTS),
+        "script": "\n".join((PARTS / name).read_text(encoding="utf-8") for name in _SCRIPTS),
     }
-    frame = (_PARTS / "page.html").read_text(encoding="utf-8")
+    frame = (PARTS / "page.html").read_text(encoding="utf-8")
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], frame)

@@ -17,7 +17,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.trajectory import write_tum
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome, refined_pose, trajectory_cells
-from msgs_slam.pipelines.evaluation.mesh_error import mesh_cells
+from msgs_slam.pipelines.evaluation.metrics import mesh_cells
 from msgs_slam.pipelines.evaluation.report import truth_section
 from msgs_slam.pipelines.evaluation.truth import match_truth, true_trajectory
 from msgs_slam.pipelines.evaluation.write import evaluation_rows, evaluation_table, write_evaluation

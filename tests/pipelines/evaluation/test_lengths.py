@@ -10,9 +10,8 @@ from finished import note_finished
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.datasets import Sequence
-from msgs_slam.pipelines.evaluation.facts import camera_height, extents, found_lengths, path_length
+from msgs_slam.pipelines.evaluation.facts import camera_height, extents, found_lengths, length_text, path_length
 from msgs_slam.pipelines.geometry.se3 import Similarity
-from msgs_slam.pipelines.geometry.tape import tape_text
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -69,7 +68,7 @@ def test_they_are_said_as_the_tape_says_them(oracle_run: OracleRun) -> None:
     true = load_outcome(oracle_run())
     in_world = path_length(true)
     assert in_world is not None
-    assert rows["length of the path"] == tape_text(*in_world, False, None)
+    assert rows["length of the path"] == length_text(*in_world, False, None)
     known = replace(outcome, metres=Metres(0.5, 0.1, True, ("a table",)))
     assert dict(found_lengths(known))["length of the path"].endswith(" m")
 
@@ -83,3 +82,11 @@ def test_what_is_not_known_is_not_told(oracle_run: OracleRun) -> None:
     lost = tuple("lost" if i > 3 else "" for i in range(len(t.lost_reasons)))
     few = load_outcome(run)
     assert path_length(replace(few, trajectory=replace(t, is_keyframe=t.frame_ids == 0, lost_reasons=lost))) is None
+
+
+def test_a_length_is_stated_in_the_units_there_are() -> None:
+    guess = Metres(2.0, 0.09, True, ("a door",))
+    assert length_text(1.5, 0.03, True, None) == "1.500 ± 0.030 m"
+    assert length_text(1.5, 0.03, False, None) == "1.500 ± 0.030 units"
+    assert length_text(1.5, 0.03, False, guess) == "1.500 ± 0.030 units ≈ 3.00 ± 0.28 m"
+    assert length_text(1.5, 0.03, True, Metres(1.0, 0.01, False, ("GPS",))) == "1.500 ± 0.034 m"

@@ -16,8 +16,6 @@ from finished import note_finished
 
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.splats import read_gaussian_glb
-from msgs_slam.formats.spz import read_spz
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.config import EXPORTS, ExportConfig
 from msgs_slam.pipelines.export import stage
@@ -33,6 +31,7 @@ from msgs_slam.pipelines.run.lock import RunBusyError, locked
 from msgs_slam.pipelines.run.target import LIST
 from msgs_slam.pipelines.scene.world import WORLD
 from msgs_slam.pipelines.types import Metres
+from tests.splat_readers import read_gaussian_glb, read_spz
 
 OracleRun = Callable[..., RunFolder]
 Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])

@@ -15,7 +15,6 @@ import torch
 from msgs_slam.formats import atomic
 from msgs_slam.formats.errors import DiskFullError
 from msgs_slam.formats.gaussians import GaussianCloud
-from msgs_slam.formats.splats import read_gaussian_glb
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.extra import tiles
 from msgs_slam.pipelines.export.stage import export_run
@@ -23,6 +22,7 @@ from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.render.api import render
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import SAME, Georeference, World
+from tests.splat_readers import read_gaussian_glb
 
 OracleRun = Callable[..., RunFolder]
 VALIDATE = """

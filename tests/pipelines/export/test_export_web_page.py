@@ -14,18 +14,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.config import ExportConfig
-from msgs_slam.pipelines.evaluation.image_quality import psnr
+from msgs_slam.pipelines.evaluation.metrics import psnr
 from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.export.extra import web_page
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.outcome import Outcome, load_outcome, map_cloud
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import FIRST, WORLD
-from tests.browser import browser
+from tests.browser import browser, in_node
 
 OracleRun = Callable[..., RunFolder]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -125,7 +127,7 @@ def test_a_browser_draws_what_we_draw(page: tuple[Path, Outcome], tmp_path: Path
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed here to open the page with")
 def test_fingers_on_a_phone_measure_turn_and_zoom(page: tuple[Path, Outcome], tmp_path: Path) -> None:
-    text = "document.getElementById('told').textContent"
+    text = "document.getElementById('note').textContent"
     with browser(tmp_path / "profile", (390, 844)) as tab:
         tab.be_a_phone()
         tab.call("Page.navigate", url=page[0].as_uri())
@@ -149,19 +151,67 @@ def test_fingers_on_a_phone_measure_turn_and_zoom(page: tuple[Path, Outcome], tm
         until(lambda: tab.value(below) > 0.85 * 844)  # the map has the screen
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed here to run the script with")
-def test_a_place_is_sure_around_where_cameras_saw_it_from_the_more_of_them_the_farther(tmp_path: Path) -> None:
-    script = (Path(web_page.__file__).parent / "page" / "cloud.js").read_text(encoding="utf-8")
+def script(*names: str) -> str:
+    return "\n".join((web_page.PARTS / name).read_text(encoding="utf-8") for name in names)
+
+
+def test_a_place_is_sure_around_where_cameras_saw_it_from_the_more_of_them_the_farther() -> None:
     ahead = [1, 0, 0, 0, 0, -1, 0, 1, 0]  # along y
     cameras = [{"r": ahead, "p": [x, 0, 0]} for x in (-2, 2)]
     places = [0, 2, 0, 1, 2, 2, 0, 1, 9, 2, 0, 1, 0, -2, 0, 1]  # seen by both, by one, by none
     cloud, about = {"places": places, "count": 4}, {"cameras": cameras, "slope": [2.1, 2.1]}
-    with browser(tmp_path / "profile") as tab:
-        text = tab.value(f"{script}; JSON.stringify([...seenFrom({json.dumps(cloud)}, {json.dumps(about)})])")
-    cones = np.array(json.loads(text)).reshape(4, 4) / 127
+    found = in_node(script("cloud.js"), "[...seenFrom(cloud, about)]", cloud=cloud, about=about)
+    cones = np.array(found).reshape(4, 4) / 127
     np.testing.assert_allclose(cones[:2, :3], [[0, -1, 0], [0, -1, 0]], atol=0.01)
     np.testing.assert_allclose(np.degrees(np.arccos(cones[:2, 3])), [45 + 40, 35], atol=1)
     assert not cones[2:].any()
+
+
+def test_a_recorded_path_is_in_the_world_of_the_files() -> None:
+    turns = Rotation.random(50, np.random.default_rng(0))
+    turn, shift = Rotation.from_euler("xyz", (20, 30, 40), degrees=True), np.array([1.0, 2, 3])
+    keyframes = [{"p": [k, 2.0, -1], "r": m.T.ravel().tolist()} for k, m in enumerate(turns.as_matrix())]
+    recorded = {"world": "run", "turn": turn.as_matrix().ravel().tolist(), "shift": shift.tolist()}
+    about = {"slope": [1.5, 2 * np.tan(np.radians(25))], "recorded": recorded}
+    expression = "JSON.parse(recordedPath(keyframes, about))"
+    path = in_node(script("cloud.js", "moves.js", "record.js"), expression, keyframes=keyframes, about=about)
+    wxyz = np.array([key["rotation_wxyz"] for key in path["keyframes"]])
+    assert (Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).inv() * turn * turns).magnitude().max() < 1e-6
+    places = np.array([key["position"] for key in path["keyframes"]])
+    np.testing.assert_allclose(places, turn.apply([key["p"] for key in keyframes]) + shift, atol=1e-9)
+    assert path["keyframes"][0]["fov_degrees"] == pytest.approx(50)
+
+
+def test_the_tape_is_true_within_what_it_states(page: tuple[Path, Outcome], truth: Sequence) -> None:
+    text, outcome = page[0].read_text(encoding="utf-8"), page[1]
+    c, rng, rows, rays, places = truth.camera, np.random.default_rng(1), [], [], []
+    assert c is not None
+    for _ in range(120):
+        row = 4 * int(rng.integers(0, 8))
+        u, v = int(rng.integers(5, c.width - 5)), int(rng.integers(5, c.height - 5))
+        depth, pose = truth.depth(row), outcome.trajectory.world_from_cam[row]
+        ray = np.array([(u + 0.5 - c.cx) / c.fx, (v + 0.5 - c.cy) / c.fy, 1])
+        rays.append([pose[:3, 3].tolist(), (pose[:3, :3] @ ray / np.linalg.norm(ray)).tolist()])
+        places.append(pose[:3, :3] @ (depth[v, u] * ray) + pose[:3, 3])
+    measure = """unpackCloud(about, map).then((cloud) => {
+      const met = rays.map(([from, ray]) => touchCloud(cloud, from, ray));
+      met.forEach((end) => { if (end) end.across = end.depth / focal; });
+      const pairs = [...Array(met.length / 2).keys()].map((k) => [met[2 * k], met[2 * k + 1]]);
+      return pairs.map(([a, b]) => (a && b ? tapeBetween(a, b, about) : null));
+    })"""
+    about = json.loads(part(text, "about"))
+    found = in_node(
+        script("cloud.js", "moves.js", "tape.js"), measure, about=about, map=part(text, "map"), rays=rays, focal=c.fx
+    )
+    for k, said in enumerate(found):
+        if said:
+            length, sd = map(float, re.fullmatch(r"([\d.]+) ± ([\d.]+) m", said).groups())
+            rows.append((abs(length - np.linalg.norm(places[2 * k] - places[2 * k + 1])), sd))
+    assert len(rows) > 50
+    error, sd = np.array(rows).T
+    assert 0 < np.median(error) < 0.03
+    assert 0.4 < np.mean(error < sd) < 0.99
+    assert np.mean(error < 3 * sd) > 0.85
 
 
 def until(happened: Callable[[], object]) -> None:

@@ -13,11 +13,11 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.evaluation.report import write_report
+from msgs_slam.pipelines.evaluation.serve import PageServer
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.viewer.scene import load_scenes
 from tests.pipelines.frames.conftest import WALK_FRAMES, render, sideways, write_walk
 
 APART = 9
@@ -71,13 +71,15 @@ def test_a_piece_has_all_that_a_run_has(whole: RunFolder) -> None:
     assert (exported / "point_cloud.ply").read_bytes() == piece.run.file("export", "point_cloud.ply").read_bytes()
 
 
-def test_report_viewer_and_status_show_it(whole: RunFolder, tmp_path: Path) -> None:
+def test_report_view_and_status_show_it(whole: RunFolder, tmp_path: Path) -> None:
     html = write_report(whole, tmp_path / "report.html").read_text()
     assert "Apart from the rest: piece 2" in html
     assert f"frames {WALK_FRAMES}–{WALK_FRAMES + APART - 1}" in html
-    scenes = load_scenes(whole.root)
-    assert [s.title for s in scenes] == ["both.msgs", "both.msgs, piece 2"]
-    assert all(len(s.centers) > 500 and s.mesh_file for s in scenes)
+    with PageServer(whole) as server:
+        assert list(server.parts()) == ["map", "piece_2"]
+        pages = [server.page(part) for part in server.parts()]
+    assert all("<canvas" in page for page in pages)
+    assert len(set(pages)) == 2
     assert "piece_2" in invoke("status", whole.root)
 
 

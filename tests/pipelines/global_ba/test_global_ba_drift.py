@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.depth.fields import FINE, DepthFields
-from msgs_slam.pipelines.evaluation.image_quality import DepthErrorSum
+from msgs_slam.pipelines.evaluation.metrics import DepthErrorSum
 from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import Similarity

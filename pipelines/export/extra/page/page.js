@@ -3,9 +3,9 @@
 
 const find = (id) => document.getElementById(id);
 const about = JSON.parse(find("about").textContent);
-const canvas = find("scene"), overlay = find("overlay"), told = find("told");
+const canvas = find("scene"), overlay = find("overlay"), note = find("note");
 const wanted = new URLSearchParams(location.hash.slice(1)), bare = wanted.has("bare");
-const state = { mode: wanted.get("mode") || "color", move: "orbit", measuring: false, ends: [], text: "", showPath: false, playing: 0 };
+const state = { mode: wanted.get("mode") || "color", move: "orbit", measuring: false, ends: [], text: "", showPath: false, playing: 0, keyframes: [] };
 const eye = makeEye(about);
 let cloud, draw, waiting = false;
 
@@ -18,15 +18,16 @@ async function start() {
   draw = makePicture(canvas, cloud, about.classes.map((c) => c.color), seenFrom(cloud, about));
   find("message").textContent = "";
   find("panel").hidden = bare;
+  reset();
+  keepOverReload(about, eye, state);
   addLegend();
   addButtons();
   addPointers();
   addKeys();
   const metres = about.unit.metric ? "Lengths are metres." : about.unit.text || "Lengths have no known unit.";
   const shown = about.count < about.total ? `${about.count.toLocaleString("en")} of ${about.total.toLocaleString("en")}` : about.count.toLocaleString("en");
-  find("facts").textContent = `${shown} Gaussians. ${metres}`;
+  find("facts").textContent = `${shown} ${about.elements}. ${metres}`;
   addEventListener("resize", again);
-  reset();
   const off = (camera) => Math.abs(camera.n - wanted.get("camera"));
   const nearest = about.cameras.reduce((best, camera) => (best && off(best) <= off(camera) ? best : camera), null);
   if (wanted.has("camera") && nearest) eye.take(nearest, about.depth);
@@ -86,12 +87,17 @@ function paint() {
   };
   if (state.showPath) line(about.path, "#f97316", 2);
   if (state.ends.length === 2) line(state.ends.map((e) => e.point), "#ef4444", 3);
+  if (!state.playing) line(state.keyframes.map((key) => key.p), "#22c55e", 3);
   for (const xy of state.ends.map((e) => onScreen(e.point))) {
     if (!xy) continue;
     pen.beginPath();
     pen.arc(...xy, 5 * ratio, 0, 7);
     pen.fillStyle = "#ef4444";
     pen.fill();
+  }
+  for (const [k, key] of state.keyframes.entries()) {
+    const xy = state.playing ? null : onScreen(key.p);
+    if (xy) label(`${k + 1}`, ...xy);
   }
   if (state.ends.length === 2) {
     const middle = onScreen(plus(state.ends[0].point, plus(state.ends[1].point, state.ends[0].point, -1), 0.5));
@@ -137,18 +143,39 @@ function addButtons() {
   find("fold").onclick = () => { find("panel").classList.toggle("folded"); again(); };
   find("reset").onclick = () => { state.playing = 0; reset(); press(); };
   find("path").onchange = () => { state.showPath = find("path").checked; again(); };
-  find("play").hidden = about.cameras.length < 2;
+  find("path").checked = state.showPath;
+  const keyframes = () => {
+    const count = state.keyframes.length, seconds = SECONDS_PER_KEYFRAME * (count - 1);
+    note.textContent = count < 2 ? "A camera path needs keyframes at two views or more." : `${count} keyframes, ${seconds} s.`;
+    offer();
+    again();
+  };
+  const offer = () => {
+    find("drop").hidden = !state.keyframes.length;
+    find("save").hidden = state.keyframes.length < 2;
+    find("play").hidden = about.cameras.length < 2 && state.keyframes.length < 2;
+  };
+  offer();
+  find("keep").onclick = () => { state.keyframes.push({ p: eye.p.slice(), r: eye.r.slice() }); keyframes(); };
+  find("drop").onclick = () => { state.keyframes.pop(); keyframes(); };
+  find("save").onclick = () => {
+    const name = `${document.title.replace(/[^\w.-]/g, "_")}-path.json`;
+    download(name, recordedPath(state.keyframes, about));
+    note.textContent = `msgs-slam render RUN out.mp4 --path ${name}`;
+  };
   find("play").onclick = () => { state.playing = state.playing ? 0 : performance.now(); press(); if (state.playing) play(press); };
   find("measure").onclick = () => {
     Object.assign(state, { measuring: !state.measuring, ends: [], text: "" });
-    told.textContent = state.measuring ? "Click or tap two places." : "";
+    note.textContent = state.measuring ? "Click or tap two places." : "";
     press();
   };
   press();
 }
 
 function play(done) {
-  const cameras = about.cameras, whole = Math.max(5, Math.min(60, cameras.at(-1).t - cameras[0].t)) * 1000;
+  const own = state.keyframes.length > 1, cameras = own ? state.keyframes : about.cameras;
+  const seconds = own ? SECONDS_PER_KEYFRAME * (cameras.length - 1) : Math.max(5, Math.min(60, cameras.at(-1).t - cameras[0].t));
+  const whole = seconds * 1000;
   const step = () => {
     if (!state.playing) return;
     const at = ((performance.now() - state.playing) / whole) * (cameras.length - 1), k = Math.floor(at);
@@ -165,13 +192,13 @@ function click(x, y, asTarget) {
   const ray = [(x * ratio - view[2]) / view[0], (y * ratio - view[3]) / view[1], 1];
   const direction = unit([0, 1, 2].map((k) => ray[0] * eye.r[k] + ray[1] * eye.r[3 + k] + eye.r[6 + k]));
   const found = touchCloud(cloud, eye.p, direction);
-  if (!found) { told.textContent = "No surface there: click on the map."; return; }
+  if (!found) { note.textContent = "No surface there: click on the map."; return; }
   found.across = (AIM_PIXELS * ratio * found.depth) / view[0];
   if (asTarget) { eye.look(eye.p, found.point); again(); return; }
   state.ends = state.ends.length === 1 ? [state.ends[0], found] : [found];
   state.text = state.ends.length === 2 ? tapeBetween(...state.ends, about) : "";
   const floor = about.floor ? ` ${lengthText(found.point[2], found.along, about)} over the floor.` : "";
-  told.textContent = state.text || `Now the second place.${floor}`;
+  note.textContent = state.text || `Now the second place.${floor}`;
   again();
 }
 

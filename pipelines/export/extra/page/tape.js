@@ -29,6 +29,6 @@ function withSd(value, sd) {
 function scaleBar(unitsPerPixel, pixels, about) {
   const perUnit = about.unit.metric ? 1 : about.unit.per_unit || 1, most = unitsPerPixel * pixels * perUnit;
   const ten = 10 ** Math.floor(Math.log10(most)), round = ten * (most >= 5 * ten ? 5 : most >= 2 * ten ? 2 : 1);
-  const told = `${+round.toPrecision(1)} ${about.unit.metric || about.unit.per_unit ? "m" : "units"}`;
-  return { pixels: round / perUnit / unitsPerPixel, text: about.unit.metric || !about.unit.per_unit ? told : `≈ ${told}` };
+  const note = `${+round.toPrecision(1)} ${about.unit.metric || about.unit.per_unit ? "m" : "units"}`;
+  return { pixels: round / perUnit / unitsPerPixel, text: about.unit.metric || !about.unit.per_unit ? note : `≈ ${note}` };
 }

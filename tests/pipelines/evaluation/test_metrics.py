@@ -1,4 +1,5 @@
-"""LPIPS: its wiring with stand-ins for the package and the file, and the real file where it lies beside the project."""
+"""PSNR and SSIM against scikit-image, depth and mesh errors of known disturbances; LPIPS with stand-ins for the package
+and the file, and by the real file where it lies beside the project."""
 
 from __future__ import annotations
 
@@ -11,19 +12,143 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 import torch
+import trimesh
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.reading import file_sha256
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
-from msgs_slam.pipelines.evaluation.image_quality import Lpips, open_lpips
+from msgs_slam.pipelines.evaluation.metrics import (
+    DepthErrorSum,
+    Lpips,
+    depth_points,
+    open_lpips,
+    psnr,
+    sample_surface,
+    seen_in_depth,
+    ssim,
+    surface_error,
+    thinned,
+)
 from msgs_slam.pipelines.evaluation.write import evaluation_table
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.types import Intrinsics
 from tests.networks import save_network
 
 OracleRun = Callable[..., RunFolder]
+
+
+@pytest.mark.parametrize("noise", [2, 10, 40])
+def test_same_as_scikit_image(noise: int) -> None:
+    rng = np.random.default_rng(noise)
+    truth = np.clip(np.cumsum(rng.normal(size=(61, 83, 3)), axis=1) * 10 + 120, 0, 255).astype(np.uint8)
+    image = np.clip(truth + rng.normal(scale=noise, size=truth.shape), 0, 255).astype(np.uint8)
+    assert psnr(image, truth) == pytest.approx(peak_signal_noise_ratio(truth, image), abs=1e-9)
+    theirs = structural_similarity(
+        truth, image, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255
+    )
+    assert ssim(image, truth) == pytest.approx(theirs, abs=1e-7)
+    assert 0 < ssim(image, truth) < 1
+
+
+def test_psnr_of_known_noise_and_of_a_mask() -> None:
+    rng = np.random.default_rng(0)
+    truth = np.full((200, 200, 3), 128.0)
+    image = truth + rng.normal(scale=5, size=truth.shape)
+    assert psnr(image, truth) == pytest.approx(20 * np.log10(255 / 5), abs=0.1)
+    mask = np.zeros((200, 200), bool)
+    mask[:100] = True
+    image[100:] = 0
+    assert psnr(image, truth, mask) == pytest.approx(20 * np.log10(255 / 5), abs=0.1)
+    assert psnr(image, truth) < 12
+    assert psnr(truth, truth) == float("inf")
+    assert ssim(truth, truth) == pytest.approx(1)
+    with pytest.raises(ValueError, match="no pixel"):
+        psnr(image, truth, np.zeros((200, 200), bool))
+
+
+def test_scale_noise_and_holes_are_told_apart() -> None:
+    rng = np.random.default_rng(0)
+    errors = DepthErrorSum()
+    for _ in range(3):
+        truth = rng.uniform(1, 5, (120, 160)).astype(np.float32)
+        truth[:12] = 0
+        depth = (0.8 * (truth + rng.normal(scale=0.03, size=truth.shape))).astype(np.float32)
+        depth[:, :40] = 0
+        errors.add(depth, truth)
+    result = errors.result()
+    assert result is not None
+    assert result.scale == pytest.approx(1.25, rel=2e-3)
+    assert result.metric_l1 == pytest.approx(0.2 * 3, rel=0.02)
+    # The mean of |normal| is sqrt(2 / pi) standard deviations.
+    assert result.scaled_l1 == pytest.approx(0.03 * np.sqrt(2 / np.pi), rel=0.03)
+    assert result.valid_fraction == pytest.approx(0.75)
+
+
+def test_equal_depth_has_no_error_and_no_overlap_no_result() -> None:
+    truth = np.linspace(1, 2, 64, dtype=np.float32).reshape(8, 8)
+    errors = DepthErrorSum()
+    errors.add(truth, truth)
+    result = errors.result()
+    assert result is not None
+    assert (result.metric_l1, result.scaled_l1, result.valid_fraction) == (0, 0, 1)
+    empty = DepthErrorSum()
+    empty.add(np.zeros_like(truth), truth)
+    assert empty.result() is None
+
+
+def test_samples_lie_on_the_surface_and_spread_by_area() -> None:
+    mesh = trimesh.creation.box((1.0, 2.0, 4.0))
+    points = sample_surface(mesh.vertices, mesh.faces, 20000)
+    np.testing.assert_allclose(np.abs(points / (0.5, 1, 2)).max(axis=1), 1, atol=1e-12)
+    on_top = np.abs(np.abs(points[:, 2]) - 2) < 1e-9
+    assert on_top.mean() == pytest.approx(2 * 2 / mesh.area, abs=0.003)
+    with pytest.raises(ValueError, match="no area"):
+        sample_surface(np.zeros((3, 3)), np.array([[0, 1, 2]]), 10)
+
+
+def test_a_grown_sphere_is_off_by_its_growth() -> None:
+    small, large = (trimesh.creation.icosphere(5, r) for r in (1.0, 1.03))
+    a, b = (sample_surface(m.vertices, m.faces, 40000) for m in (small, large))
+    found = surface_error(b, a, threshold=0.05)
+    assert found.accuracy == pytest.approx(0.03, rel=0.1)
+    assert found.completeness == pytest.approx(0.03, rel=0.1)
+    assert found.f_score == pytest.approx(1, abs=1e-3)
+    assert surface_error(b, a, threshold=0.02).f_score == 0
+
+
+def test_a_missing_half_costs_completeness_alone() -> None:
+    mesh = trimesh.creation.box((2.0, 2.0, 2.0))
+    truth = sample_surface(mesh.vertices, mesh.faces, 60000)
+    half = truth[truth[:, 0] > 0]
+    found = surface_error(half, truth)
+    assert found.accuracy == 0
+    assert found.precision == 1
+    assert found.recall == pytest.approx(0.5, abs=0.05)
+    # The far face is 1 m from the cut, the four sides half that on average: (4 x 2 x 0.5 + 4 x 1.2) / 24 roughly.
+    assert 0.3 < found.completeness < 0.5
+    with pytest.raises(ValueError, match="nothing to compare"):
+        surface_error(half, truth[:0])
+
+
+def test_depth_gives_points_where_they_are_and_tells_what_is_seen() -> None:
+    camera = Intrinsics(40, 30, 50.0, 50.0, 20.0, 15.0)
+    depth = np.full((30, 40), 2.0)
+    depth[:, :10] = 0
+    pose = np.eye(4)
+    pose[:3, 3] = (1, 0, 0)
+    points = depth_points(depth, camera, pose)
+    assert len(points) == 30 * 30
+    np.testing.assert_allclose(points[:, 2], 2)
+    np.testing.assert_allclose(points[0], [1 + (10.5 - 20) / 50 * 2, (0.5 - 15) / 50 * 2, 2])
+    probes = points[[465, 465, 465]] + np.array([[0, 0, -0.5], [0, 0, 0.01], [0, 0, 0.5]])
+    outside = np.array([[9.0, 0, 2], [1.0, 0, -2]])
+    seen = seen_in_depth(np.concatenate([probes, outside]), depth, camera, np.linalg.inv(pose), 0.05)
+    assert seen.tolist() == [True, True, False, False, False]
+    assert len(thinned(np.repeat(points, 3, axis=0), 1e-6)) == len(points)
 
 
 class StandIn:

@@ -1,28 +1,23 @@
-"""The finished map as a video or as images, along the run's own path, the same smoothed, an orbit or another."""
+"""The finished map as a film or as images: along the run's own path, the same smoothed, an orbit or a recorded one."""
+
+from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from ...formats.errors import InputError, install_extra
 from ...formats.images import write_rgb
-from ...formats.splats import read_gaussians
+from ...formats.textfile import number, read_json_object
 from ...formats.video_writer import CODECS, PLAYED, write_browser_video, write_video
-from ..evaluation.views import (
-    Picture,
-    SplatScene,
-    depth_picture,
-    depth_range,
-    draw_splats,
-    label_picture,
-    render_outcome,
-)
+from ..export.extra.web_page import EXPORTED, RUN
 from ..outcome import Outcome, load_outcome
 from ..run.folder import RunFolder
 from ..run.target import Target
@@ -30,28 +25,25 @@ from ..scene.world import WORLD, up_in_run
 from ..source.recording import is_of_source
 from ..system.progress import Progress, SilentProgress, log
 from ..system.wording import quoted
-from ..types import Intrinsics
-from .camera_path import RUN, SPLATS, CameraPath, read_camera_path
-from .scene import UP_OF_SPLATS
-
-Array = NDArray[np.float64]
-
-_FROM_OUTSIDE = 1.4
-"""Sizes of a scene that one stands away from its middle: then it fills most of an image of 50 degrees."""
+from ..types import Array, Intrinsics
+from .views import Picture, depth_picture, depth_range, label_picture, render_outcome
 
 _ALL_ROUND, _LEAST_ARC = np.radians(270), np.radians(20)
 """An arc of cameras from which an orbit goes all the way: what the rest would see, others saw from beside it; and the
 arc of a camera that hardly moved sideways."""
 
-KINDS = ("color", "depth", "labels", "side-by-side")
+KINDS = ("color", "depth", "labels")
 PATHS = ("own", "smooth", "orbit")
 _SMOOTHING_SECONDS = 0.5
 _MAX_GAP, _MAX_OF_PHOTOS = 1.0, 60.0
 """Seconds of film between two neighbouring frames, and of a film along photos, which may be days apart."""
 _IMAGE_NAME = re.compile(r"\d{6,}\.png")
 _FILE_SUFFIX = re.compile(r"\.[a-z][a-z0-9]{1,4}")
-_FILE_SIZE, _FIELD_OF_VIEW = (960, 540), 50.0
-"""Of images of a splat file, which stores no cameras: the field of view is from top to bottom, in degrees."""
+
+_FORMAT = "msgs-slam camera path 1"
+_LIMITS = {"fps": (0.1, 240.0), "seconds_per_keyframe": (0.05, 600.0), "fov_degrees": (1.0, 170.0)}
+_MAX_KEYFRAMES, _MAX_IMAGES = 1000, 100_000
+_AGAIN = "correct it, or record the path again in `msgs-slam view`"
 
 
 def render_run(
@@ -81,118 +73,19 @@ def render_run(
         raise InputError(f"{target} is the source of {run.root}: name another file or folder")
     place = _target(target, rate, overwrite)
     given = _given_path(path, fps)
-    flown = None if given is None else _in_world_of_run(given, run)
+    flight = None if given is None else _in_world_of_run(given, run)
     outcome = load_outcome(run)
     outcome.require_map()
     outcome = outcome if size is None else _of_size(outcome, size)
     near, far = _depth_range(outcome)
-    if flown is None:
-        poses = _path(outcome, str(path), rate, (near * far) ** 0.5)
-        views = [(outcome, pose) for pose in poses]
+    if flight is None:
+        views = [(outcome, pose) for pose in _path(outcome, str(path), rate, (near * far) ** 0.5)]
     else:
-        views = [(_seeing(outcome, fov), pose) for pose, fov in zip(*flown, strict=True)]
+        views = [(_with_fov(outcome, fov), pose) for pose, fov in zip(*flight, strict=True)]
     rate = rate if given is None else given.fps
-    tell(_length(len(views), rate))
+    tell(f"rendering {len(views)} images: a film of {len(views) / rate:.0f} s at {rate:g} images a second")
     steps = (progress or SilentProgress()).track(views, "rendering", len(views))
     return _write(place, target, (_draw(seen, pose, kind, near, far) for seen, pose in steps), rate)
-
-
-def _length(count: int, fps: float) -> str:
-    return f"rendering {count} images: a film of {count / fps:.0f} s at {fps:g} images a second"
-
-
-def render_file(
-    source: Path,
-    target: Path,
-    fps: float | None = None,
-    progress: Progress | None = None,
-    size: tuple[int, int] | None = None,
-    path: str | Path = "orbit",
-    tell: Callable[[str], None] = log.info,
-    overwrite: bool = False,
-) -> Path:
-    """Draw a splat file by any program along a circle round it, or the camera path in the file `path`, otherwise as
-    `render_run`; by default 960x540.
-
-    Raises InputError for a file that cannot be read or is empty, or a camera path in the world of a run.
-    """
-    rate = 30.0 if fps is None else fps
-    place = _target(target, rate, overwrite)
-    given = _of_file(_given_path(path, fps), path, source)
-    cloud = read_gaussians(source)
-    if len(cloud) == 0:
-        raise InputError(f"{source}: contains no Gaussians: nothing can be drawn. Export it again")
-    scene, (width, height) = SplatScene.of(cloud), size or _FILE_SIZE
-    if given is None:
-        poses = around(scene.middle, scene.size, UP_OF_SPLATS, round(10 * rate))
-        fovs = np.full(len(poses), _FIELD_OF_VIEW)
-    else:
-        (poses, fovs), rate = given.flight(), given.fps
-    cameras = [_camera(width, height, fov) for fov in fovs]
-    tell(_length(len(poses), rate))
-    steps = (progress or SilentProgress()).track(range(len(poses)), "rendering", len(poses))
-    return _write(place, target, (draw_splats(scene, cameras[i], np.linalg.inv(poses[i])) for i in steps), rate)
-
-
-def _camera(width: int, height: int, fov: float) -> Intrinsics:
-    focal = height / 2 / np.tan(np.radians(fov) / 2)
-    return Intrinsics(width, height, focal, focal, width / 2, height / 2)
-
-
-def _of_file(path: CameraPath | None, file: str | Path, source: Path) -> CameraPath | None:
-    """The path in the world of the splat file `source`: one that was recorded in the run is turned where world.json
-    beside that says how."""
-    if path is not None and path.world == RUN:
-        raise InputError(
-            f"{file} was recorded in a run before its export, in other coordinates than a splat file has: give the run "
-            "instead of the splat file, or record the path again"
-        )
-    if path is None or path.world == SPLATS or not (beside := source.with_name(WORLD.name)).is_file():
-        return path
-    return _turned(path, WORLD.read(beside).image_axes_from_exported)
-
-
-def _turned(path: CameraPath, rotation: Array) -> CameraPath:
-    motion = np.eye(4)
-    motion[:3, :3] = rotation
-    keyframes = tuple(replace(key, world_from_cam=motion @ key.world_from_cam) for key in path.keyframes)
-    return replace(path, keyframes=keyframes)
-
-
-def _given_path(path: str | Path, fps: float | None) -> CameraPath | None:
-    """The camera path in a file; None for a name of `PATHS`."""
-    if path in PATHS:
-        return None
-    if not Path(path).is_file():
-        raise InputError(
-            f"path is one of {', '.join(PATHS)}, or a camera path that `msgs-slam view` has saved; there is no file "
-            f"{str(path)!r}"
-        )
-    return read_camera_path(Path(path), fps)
-
-
-def _in_world_of_run(path: CameraPath, run: RunFolder) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The flight in the run's own world: (N, 4, 4) world_from_cam, (N,) fields of view in degrees."""
-    if path.world == RUN:
-        return path.flight()
-    if (world := run.find(WORLD)) is None:
-        raise InputError(
-            f"the camera path is in the coordinates of exported files, and {run.root} has none: "
-            f"run `msgs-slam resume {quoted(run.root)}` first"
-        )
-    if path.world == SPLATS:
-        path = _turned(path, world.image_axes_from_exported.T)
-    poses, fovs = path.flight()
-    cam_from_run = world.exported_from_run.inverse().apply_to_poses(np.linalg.inv(poses))
-    return np.asarray(np.linalg.inv(cam_from_run), np.float64), fovs
-
-
-def _seeing(outcome: Outcome, fov: float) -> Outcome:
-    """The same seen by a camera with this field of view from top to bottom, in degrees."""
-    k = outcome.calibration.intrinsics
-    fy = k.height / 2 / float(np.tan(np.radians(fov) / 2))
-    zoomed = replace(k, fx=k.fx * fy / k.fy, fy=fy)
-    return replace(outcome, calibration=replace(outcome.calibration, intrinsics=zoomed))
 
 
 def _target(target: Path, fps: float, overwrite: bool) -> Target:
@@ -219,8 +112,8 @@ def _belongs(target: Path) -> Callable[[str], bool]:
 def _write(place: Target, target: Path, pictures: Iterator[Picture], fps: float) -> Path:
     with place.replacing(_belongs(target)) as staged:
         if (kind := target.suffix.lower()) not in CODECS:
-            for number, picture in enumerate(pictures):
-                write_rgb(staged / f"{number:06d}.png", picture)
+            for index, picture in enumerate(pictures):
+                write_rgb(staged / f"{index:06d}.png", picture)
         elif kind != ".mp4":
             write_video(staged / target.name, pictures, fps)
         elif (codec := write_browser_video(staged / target.name, pictures, fps)) not in PLAYED:
@@ -237,13 +130,22 @@ def _of_size(outcome: Outcome, size: tuple[int, int]) -> Outcome:
     k = outcome.calibration.intrinsics
     width, height = size
     scale = height / k.height
-    fx, fy, cx, cy = k.fx * scale, k.fy * scale, k.cx * scale + (width - k.width * scale) / 2, k.cy * scale
-    return replace(
-        outcome, calibration=replace(outcome.calibration, intrinsics=Intrinsics(width, height, fx, fy, cx, cy))
-    )
+    cx = k.cx * scale + (width - k.width * scale) / 2
+    return _seen_by(outcome, Intrinsics(width, height, k.fx * scale, k.fy * scale, cx, k.cy * scale))
 
 
-def _path(outcome: Outcome, path: str, fps: float, scene_depth: float) -> NDArray[np.float64]:
+def _with_fov(outcome: Outcome, fov: float) -> Outcome:
+    """The same seen by a camera with this field of view from top to bottom, in degrees."""
+    k = outcome.calibration.intrinsics
+    fy = k.height / 2 / float(np.tan(np.radians(fov) / 2))
+    return _seen_by(outcome, replace(k, fx=k.fx * fy / k.fy, fy=fy))
+
+
+def _seen_by(outcome: Outcome, camera: Intrinsics) -> Outcome:
+    return replace(outcome, calibration=replace(outcome.calibration, intrinsics=camera))
+
+
+def _path(outcome: Outcome, path: str, fps: float, scene_depth: float) -> Array:
     t = outcome.trajectory
     own = t.world_from_cam[t.is_posed]
     times = t.timestamps[t.is_posed]
@@ -254,7 +156,7 @@ def _path(outcome: Outcome, path: str, fps: float, scene_depth: float) -> NDArra
     return dense if path == "own" else smoothed(dense, _SMOOTHING_SECONDS * len(dense) / max(seconds, 1e-6))
 
 
-def film_seconds(times: NDArray[np.float64]) -> float:
+def film_seconds(times: Array) -> float:
     """Length in seconds of a film along frames taken at `times` (N,) seconds: their own, without gaps above a second;
     of photos, which have such gaps throughout, at most a minute."""
     gaps = np.diff(times)
@@ -270,28 +172,20 @@ def _depth_range(outcome: Outcome) -> tuple[float, float]:
     return float(ranges[:, 0].min()), float(ranges[:, 1].max())
 
 
-def _draw(outcome: Outcome, world_from_cam: NDArray[np.float64], kind: str, near: float, far: float) -> Picture:
+def _draw(outcome: Outcome, world_from_cam: Array, kind: str, near: float, far: float) -> Picture:
     view = render_outcome(outcome, np.asarray(np.linalg.inv(world_from_cam), np.float64))
-    pictures = {
-        "color": lambda: view.exposed(None, 0.0),
-        "depth": lambda: depth_picture(view.depth, near, far),
-        "labels": lambda: label_picture(view.labels, outcome.classes.colors),
-    }
-    if kind == "side-by-side":
-        return np.concatenate([draw() for draw in pictures.values()], axis=1)
-    return pictures[kind]()
+    if kind == "depth":
+        return depth_picture(view.depth, near, far)
+    return view.exposed(None, 0.0) if kind == "color" else label_picture(view.labels, outcome.classes.colors)
 
 
 def resampled(world_from_cam: Array, count: int) -> Array:
     """(count, 4, 4) poses evenly along the path in frames: centres linear, rotations on the shortest arc."""
     if len(world_from_cam) < 2:
         return np.repeat(world_from_cam, count, axis=0)
-    at = np.linspace(0, len(world_from_cam) - 1, count)
-    known = np.arange(len(world_from_cam))
-    path = np.tile(np.eye(4), (count, 1, 1))
-    path[:, :3, :3] = Slerp(known, Rotation.from_matrix(world_from_cam[:, :3, :3]))(at).as_matrix()
-    path[:, :3, 3] = np.stack([np.interp(at, known, world_from_cam[:, k, 3]) for k in range(3)], axis=1)
-    return path
+    at, known = np.linspace(0, len(world_from_cam) - 1, count), np.arange(len(world_from_cam))
+    centers = np.stack([np.interp(at, known, world_from_cam[:, k, 3]) for k in range(3)], axis=1)
+    return _poses(Slerp(known, Rotation.from_matrix(world_from_cam[:, :3, :3]))(at).as_matrix(), centers)
 
 
 def smoothed(world_from_cam: Array, sigma: float) -> Array:
@@ -300,10 +194,14 @@ def smoothed(world_from_cam: Array, sigma: float) -> Array:
     # q and -q are one rotation; neighbours must have the same sign before they are averaged.
     flips = np.cumprod(np.concatenate([[1.0], np.where((quat_xyzw[1:] * quat_xyzw[:-1]).sum(axis=1) < 0, -1.0, 1.0)]))
     mean_quat = gaussian_filter1d(quat_xyzw * flips[:, None], sigma, axis=0, mode="nearest")
-    path = world_from_cam.copy()
-    path[:, :3, :3] = Rotation.from_quat(mean_quat).as_matrix()
-    path[:, :3, 3] = gaussian_filter1d(world_from_cam[:, :3, 3], sigma, axis=0, mode="nearest")
-    return path
+    centers = gaussian_filter1d(world_from_cam[:, :3, 3], sigma, axis=0, mode="nearest")
+    return _poses(Rotation.from_quat(mean_quat).as_matrix(), centers)
+
+
+def _poses(rotations: Array, centers: Array) -> Array:
+    poses = np.tile(np.eye(4), (len(centers), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rotations, centers
+    return poses
 
 
 def orbit(world_from_cam: Array, scene_depth: float, count: int, up: Array) -> Array:
@@ -314,7 +212,8 @@ def orbit(world_from_cam: Array, scene_depth: float, count: int, up: Array) -> A
     unit vector in the world.
     """
     focus, radius, height = _focus(world_from_cam, up, scene_depth)
-    first = _any_across(up)
+    first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    first /= np.linalg.norm(first)
     second = np.cross(up, first)
     away = world_from_cam[:, :3, 3] - focus
     start, arc = _arc(np.arctan2(away @ second, away @ first))
@@ -322,7 +221,7 @@ def orbit(world_from_cam: Array, scene_depth: float, count: int, up: Array) -> A
     turns = share if arc >= _ALL_ROUND else (1 - np.cos(2 * np.pi * share)) / 2
     angle = start + (2 * np.pi if arc >= _ALL_ROUND else arc) * turns
     centers = focus + radius * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second) + height * up
-    return _looking_at(centers, focus, up)
+    return _facing(centers, focus, up)
 
 
 def _arc(angles: Array) -> tuple[float, float]:
@@ -333,15 +232,6 @@ def _arc(angles: Array) -> tuple[float, float]:
     arc = float(2 * np.pi - gaps[widest])
     beyond = max(_LEAST_ARC - arc, 0) / 2
     return float(angles[(widest + 1) % len(angles)]) - beyond, arc + 2 * beyond
-
-
-def around(middle: Array, size: float, up: Array, count: int) -> Array:
-    """(count, 4, 4) once round a scene of which no camera is known, a little from above; `size` is its largest side."""
-    first = _any_across(up)
-    second = np.cross(up, first)
-    angle = 2 * np.pi * np.arange(count) / count
-    circle = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
-    return _looking_at(middle + _FROM_OUTSIDE * size * (circle + 0.25 * up), middle, up)
 
 
 def _focus(world_from_cam: Array, up: Array, scene_depth: float) -> tuple[Array, float, float]:
@@ -360,17 +250,115 @@ def _focus(world_from_cam: Array, up: Array, scene_depth: float) -> tuple[Array,
     return focus, max(radius, 0.3 * scene_depth), float(np.median(heights))
 
 
-def _any_across(up: Array) -> Array:
-    side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    return np.asarray(side / np.linalg.norm(side))
-
-
-def _looking_at(centers: Array, target: Array, up: Array) -> Array:
+def _facing(centers: Array, target: Array, up: Array) -> Array:
     forward = target - centers
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right, axis=1, keepdims=True)
-    path = np.tile(np.eye(4), (len(centers), 1, 1))
-    path[:, :3, 0], path[:, :3, 1], path[:, :3, 2] = right, np.cross(forward, right), forward
-    path[:, :3, 3] = centers
-    return path
+    return _poses(np.stack([right, np.cross(forward, right), forward], axis=2), centers)
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Keyframes the same time apart in `world`, EXPORTED or RUN: world_from_cam (K, 4, 4), x right, y down, z forward,
+    and fields of view (K,) from top to bottom in degrees; fps: images per second."""
+
+    world_from_cam: Array
+    fovs: Array
+    fps: float
+    seconds_per_keyframe: float
+    world: str
+
+    def flight(self) -> tuple[Array, Array]:
+        """(N, 4, 4) world_from_cam and (N,) fields of view in degrees: positions follow a Catmull-Rom spline, rotations
+        the shortest arc."""
+        known = np.arange(len(self.fovs))
+        at, centers = np.linspace(0, known[-1], self.image_count), self.world_from_cam[:, :3, 3]
+        rotations = Slerp(known, Rotation.from_matrix(self.world_from_cam[:, :3, :3]))(at)
+        # Central differences as tangents make a cubic Hermite spline a Catmull-Rom spline.
+        poses = _poses(rotations.as_matrix(), CubicHermiteSpline(known, centers, np.gradient(centers, axis=0))(at))
+        return poses, np.interp(at, known, self.fovs)
+
+    @property
+    def image_count(self) -> int:
+        """The number of images of the flight, both ends included."""
+        return max(2, round((len(self.fovs) - 1) * self.seconds_per_keyframe * self.fps) + 1)
+
+
+def _given_path(path: str | Path, fps: float | None) -> CameraPath | None:
+    """The camera path in a file; None for a name of `PATHS`."""
+    if path in PATHS:
+        return None
+    if not Path(path).is_file():
+        raise InputError(
+            f"path is one of {', '.join(PATHS)}, or a camera path that `msgs-slam view` has saved; there is no file "
+            f"{str(path)!r}"
+        )
+    return read_camera_path(Path(path), fps)
+
+
+def _in_world_of_run(path: CameraPath, run: RunFolder) -> tuple[Array, Array]:
+    """The flight in the run's own world: (N, 4, 4) world_from_cam, (N,) fields of view in degrees."""
+    poses, fovs = path.flight()
+    if path.world == RUN:
+        return poses, fovs
+    if (world := run.find(WORLD)) is None:
+        raise InputError(
+            f"the camera path is in the coordinates of exported files, and {run.root} has none: "
+            f"run `msgs-slam resume {quoted(run.root)}` first"
+        )
+    cam_from_run = world.exported_from_run.inverse().apply_to_poses(np.linalg.inv(poses))
+    return np.asarray(np.linalg.inv(cam_from_run), np.float64), fovs
+
+
+def read_camera_path(path: Path, fps: float | None = None) -> CameraPath:
+    """Read a path that the map's page has saved, or a person has written; `fps` replaces the file's images per second.
+
+    Raises InputError, with the entry that is wrong, for anything that cannot be flown along.
+    """
+    value = read_json_object(path)
+    if value.get("format") != _FORMAT:
+        found = str(value.get("format"))[:40]
+        raise InputError(
+            f"{path} is no camera path: its format is {found!r}, expected {_FORMAT!r}. {_AGAIN[0].upper()}{_AGAIN[1:]}"
+        )
+    if (world := value.get("world")) not in (EXPORTED, RUN):
+        raise InputError(f"{path}: world is {str(world)[:40]!r}, expected {EXPORTED!r} or {RUN!r}: {_AGAIN}")
+    rows = value.get("keyframes")
+    if not isinstance(rows, list) or not 2 <= len(rows) <= _MAX_KEYFRAMES:
+        count = len(rows) if isinstance(rows, list) else "no list of"
+        raise InputError(f"{path} has {count} keyframes, expected 2 to {_MAX_KEYFRAMES}: {_AGAIN}")
+    poses, fovs = zip(*(_keyframe(path, i, row) for i, row in enumerate(rows, 1)), strict=True)
+    rate, seconds = fps or _limited(value, path, "fps"), _limited(value, path, "seconds_per_keyframe")
+    found_path = CameraPath(np.stack(poses), np.array(fovs), rate, seconds, str(world))
+    if (count := found_path.image_count) > _MAX_IMAGES:
+        raise InputError(
+            f"{path}: the flight has {count:,} images, at most {_MAX_IMAGES:,}: "
+            "lower fps or seconds_per_keyframe, or split the path"
+        )
+    return found_path
+
+
+def _keyframe(path: Path, index: int, row: Any) -> tuple[Array, float]:
+    where = f"{path}: keyframe {index}"
+    if not isinstance(row, dict):
+        raise InputError(f"{where} is {str(row)[:40]!r}, expected an object in braces: {_AGAIN}")
+    position, wxyz = (_vector(where, row, name, n) for name, n in (("position", 3), ("rotation_wxyz", 4)))
+    if not 0.9 < np.linalg.norm(wxyz) < 1.1:
+        raise InputError(f"{where}: rotation_wxyz is no unit quaternion (w, x, y, z): {_AGAIN}")
+    pose = _poses(Rotation.from_quat(wxyz[None, [1, 2, 3, 0]]).as_matrix(), position[None])[0]
+    return pose, _limited(row, Path(where), "fov_degrees")
+
+
+def _vector(where: str, row: dict[str, Any], name: str, length: int) -> Array:
+    value = row.get(name)
+    if not isinstance(value, list) or len(value) != length or not all(type(v) in (int, float) for v in value):
+        raise InputError(f"{where}: {name} is {str(value)[:60]!r}, expected {length} numbers: {_AGAIN}")
+    return np.array(value, np.float64)
+
+
+def _limited(table: dict[str, Any], path: Path, name: str) -> float:
+    value, (low, high) = number(table, path, name), _LIMITS[name]
+    if not low <= value <= high:
+        raise InputError(f"{path}: {name} is {value:g}, expected {low:g} to {high:g}: {_AGAIN}")
+    return value
