@@ -53,7 +53,7 @@ class FusedDepth(DepthProvider):
         self.metric = learned.metric
         self._scale = DepthScale({})
         self._fields = DepthFields({})
-        self._small = LruCache(self._bend_small, _KEPT)
+        self._small = LruCache(self._at_stereo_size, _KEPT)
 
     def missing(self, frames: list[Frame]) -> list[Frame]:
         """The frames that neither knows."""
@@ -72,7 +72,7 @@ class FusedDepth(DepthProvider):
         model, camera, poses = self._sequence.backbone, self._sequence.intrinsics, self._sequence.cam_from_world
         unknown = {f.id for p in (self._learned, self._stereo) for f in p.missing(frames)}
         known = [f for f in frames if f.id not in unknown]
-        views = kept_views(len(known), lambda n: posed_small(self._sharp(known[n]), camera, poses[known[n].id]))
+        views = kept_views(len(known), lambda n: posed_small(self._sharpened(known[n]), camera, poses[known[n].id]))
         rows = {int(f): k for k, f in enumerate(model.frame_ids)} if model is not None else {}
         anchors = {}
         for n, frame in enumerate(known):
@@ -91,24 +91,24 @@ class FusedDepth(DepthProvider):
         xy, depth, confidence = view.grid(SAMPLES_ACROSS)
         return Anchors(xy * (width / view.intrinsics.width), depth, np.sqrt(_VARIANCE / confidence**3))
 
-    def _sharp(self, frame: Frame) -> DepthEstimate:
+    def _sharpened(self, frame: Frame) -> DepthEstimate:
         """The learned depth in the unit of the backbone, its steps sharpened; of known confidence everywhere."""
         depth = sharpen_steps(self._learned.estimate(frame).depth)
         depth /= np.float32(self._scale.of_frame.get(frame.id, self._scale.value))
         return DepthEstimate(depth, (depth > 0).astype(np.float32))
 
-    def _bend(self, frame: Frame) -> NDArray[np.float32]:
+    def _apply_scale_field(self, frame: Frame) -> NDArray[np.float32]:
         """(H, W) the learned depth in the unit of the backbone, by the frame's field if it has one."""
-        depth = self._sharp(frame).depth
+        depth = self._sharpened(frame).depth
         return depth * self._fields.scales(frame.id, *depth.shape) if frame.id in self._fields.of_frame else depth
 
-    def _bend_small(self, frame: Frame) -> NDArray[np.float32]:
+    def _at_stereo_size(self, frame: Frame) -> NDArray[np.float32]:
         """The same at the size that the stereo matches."""
-        return resize_depth(self._bend(frame), self._stereo.camera.height, self._stereo.camera.width)
+        return resize_depth(self._apply_scale_field(frame), self._stereo.camera.height, self._stereo.camera.width)
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         """Fuse the learned depth of a frame with its stereo depth."""
-        bent = self._bend(frame)
+        bent = self._apply_scale_field(frame)
         if frame.id in self._fields.of_frame:
             own, agreed = self._small(frame), self._stereo.agreed(frame, self._small)
             change = np.divide(agreed, own, out=np.ones_like(own), where=own > 0)

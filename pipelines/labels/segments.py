@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError
-from ..depth.completion.fill import spread_in_place
+from ..depth.completion.fill import domain_transform_in_place
 from ..geometry.camera import resample_nearest, unproject_depth
 from ..geometry.room_layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
 from ..geometry.voxels import (
@@ -162,7 +162,7 @@ def label_pixels(votes: NDArray[np.float32], trust: NDArray[np.float32], image: 
     colours of the image to where it is low; VOID where nothing is known from near or far. The votes are spread in
     place: of a network's classes each copy takes as much memory as all else of a frame."""
     votes *= (_MIN_VOTE + trust**2)[..., None]
-    spread_in_place(votes, image, _REACH, _COLOR_SD)
+    domain_transform_in_place(votes, image, _REACH, _COLOR_SD)
     return LabelEstimate(*_settle(votes))
 
 

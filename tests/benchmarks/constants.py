@@ -38,8 +38,8 @@ AS_IT_IS = "as it is"
 AFTER = {
     "agreeing depths": ("stereo/provider.py", "_TOLERANCE = 0.01", "0.01"),
     "sure from": ("completion/fill.py", "SURE = 0.3", "0.3"),
-    "reach of company": ("completion/fill.py", "_COMPANY_REACH, _COMPANY_SD = 3 / 80, 30.0", "3"),
-    "colours of company": ("completion/fill.py", "_COMPANY_REACH, _COMPANY_SD = 3 / 80, 30.0", "30.0"),
+    "reach of company": ("completion/fill.py", "_SMOOTH_REACH, _SMOOTH_SD = 3 / 80, 30.0", "3"),
+    "colours of company": ("completion/fill.py", "_SMOOTH_REACH, _SMOOTH_SD = 3 / 80, 30.0", "30.0"),
     "colours of near evidence": (
         "completion/fill.py",
         "_REACHES = ((1 / 16, 30.0, 1.0), (1 / 4, 60.0, 0.1))",
@@ -54,7 +54,7 @@ AFTER = {
     "ridge of planes": ("completion/fill.py", "_RIDGE = 3e-4", "3e-4"),
     "faint variance": ("completion/fill.py", "_FAINT, _POWER = 5e-5, 0.25", "5e-5"),
     "power of contrast": ("completion/fill.py", "_FAINT, _POWER = 5e-5, 0.25", "0.25"),
-    "power of evidence": ("completion/candidates.py", "_EVIDENCE_POWER = 2.5", "2.5"),
+    "power of evidence": ("completion/evidence.py", "_EVIDENCE_POWER = 2.5", "2.5"),
     "likeness to borrow": ("completion/evidence.py", "_LEAST = 0.5", "0.5"),
     "colours of borrowing": ("completion/fill.py", "_COLOR_SD = 3.0", "3.0"),
     "borrowed depths agree": ("completion/fill.py", "_AGREE = 0.02", "0.02"),
@@ -69,8 +69,8 @@ WITHIN = {
     "jump": ("stereo/matching.py", "SMALL_STEP, JUMP, EDGE = 0.1, 1.2, 0.05", "1.2"),
     "edge of a jump": ("stereo/matching.py", "SMALL_STEP, JUMP, EDGE = 0.1, 1.2, 0.05", "0.05"),
     "stiffness": ("stereo/matching.py", "STIFFNESS = 0.01", "0.01"),
-    "near margin": ("stereo/neighbours.py", "_NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5", "0.45"),
-    "far margin": ("stereo/neighbours.py", "_NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5", "1.5"),
+    "near margin": ("stereo/provider.py", "_NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5", "0.45"),
+    "far margin": ("stereo/provider.py", "_NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5", "1.5"),
 }
 
 

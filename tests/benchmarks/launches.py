@@ -36,7 +36,7 @@ from torch.utils._pytree import tree_flatten
 
 from msgs_slam.pipelines.compute import gpu
 from msgs_slam.pipelines.config import MappingConfig
-from msgs_slam.pipelines.depth.stereo import card
+from msgs_slam.pipelines.depth.stereo import cuda as stereo_cuda
 from msgs_slam.pipelines.depth.stereo.matching import StereoImages
 from msgs_slam.pipelines.mapping.optimise import MapOptimiser
 from msgs_slam.pipelines.mapping.schedule import Step
@@ -207,8 +207,8 @@ def stereo_of_a_keyframe() -> None:
     pictures = np.random.default_rng(0).random((9, 6, 10)).astype(np.float32)
     warps = np.repeat(np.eye(3, 4)[None], 8, 0)
     warps[:, 0, 3] = 5 * np.arange(8)
-    card.match_planes(StereoImages(pictures[0], pictures[1:7], warps[:6]), np.linspace(0.2, 1.0, 4), DEVICE)
-    card.fuse_depths(pictures[0], pictures[1:], warps, warps[:, 2], 0.01, DEVICE)
+    stereo_cuda.match_planes(StereoImages(pictures[0], pictures[1:7], warps[:6]), np.linspace(0.2, 1.0, 4), DEVICE)
+    stereo_cuda.fuse_depths(pictures[0], pictures[1:], warps, warps[:, 2], 0.01, DEVICE)
 
 
 def step(view: int, note: bool = False) -> Step:

@@ -1,5 +1,6 @@
-"""Evidence for and against each candidate depth of a pixel: its support, and other keyframes."""
+"""Depths that a pixel could have, and evidence for and against each: its support, and other keyframes."""
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -7,10 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...system.jit import kernel
-from .candidates import Array, Candidates, Half, find_candidates, invert
-from .fill import SURE, agreed_depth, carry_depth
+from .fill import SURE, agreed_depth, carry_depth, local_planes
 
+Array = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
+KINDS = (
+    "fill", "own", "lent", "left", "right", "above", "below", "left line", "right line", "above line", "below line",
+    "own around",
+)  # fmt: skip
+_EVIDENCE_POWER = 2.5
+LENT_CONFIDENCE = np.float32(0.35)
+"""Of what others lend."""
+_FADE = 0.04
+"""Of the image's longer side: over this length a sure depth's say in the line through it fades."""
+_STEP = 0.04
+"""Relative difference to the line at which another surface begins."""
+_FLAT = 6.0
+"""Squared pixels added to the spread of places: short lines are kept flat."""
 OF_CANDIDATE, OF_PLACE = 13, 6
 FEATURES = OF_CANDIDATE + OF_PLACE
 """Numbers that are known of each candidate of a pixel, and of the pixel."""
@@ -28,11 +42,115 @@ six rooms' proxies 1.0 is 1 to 4 % worse on three and 0.2 % better on three; of 
 
 
 @dataclass(frozen=True)
-class Case:
+class HalfResKeyframe:
+    """A keyframe at half the size: inverse depth (0: none) and confidence (h, w) of the surest of four pixels, picture
+    (h, w, 3) as RGB and in CIE Lab, and contrast as of `surface_contrast` (h, w)."""
+
+    inverse: Array
+    confidence: Array
+    image: NDArray[np.uint8]
+    lab: Array
+    contrast: Array
+
+
+def invert(values: Array) -> Array:
+    """1 / values, and 0 stays 0: depth from inverse depth and back."""
+    out = np.zeros_like(values)
+    np.divide(1, values, out=out, where=values > 0)
+    return out
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Depths that P pixels (flat indices) could have, inverse (P, K), 0 where a kind says nothing; flat index of the
+    sure pixel that speaks (P, K), the pixel itself where there is none; how much there is behind it (P, K)."""
+
+    pixels: NDArray[np.int64]
+    inverse: Array
+    support: NDArray[np.int32]
+    weight: Array
+
+
+def find_candidates(own: HalfResKeyframe, lent: Array, mass: Array, sure: NDArray[np.bool_]) -> Candidates:
+    """List what the pixels of a keyframe that are not `sure` (h, w) could have, from those that are, by their own match
+    or by the inverse depths lent by others (h, w), who agree as much as `mass` (h, w) says."""
+    pixels = np.flatnonzero(~sure)
+    known_inverse_depth = np.where(sure & (own.confidence < SURE) | (own.confidence <= 0), lent, own.inverse)
+    values = np.where(sure, known_inverse_depth, np.float32(0)).astype(np.float32)
+    inverse = np.zeros((len(KINDS), *sure.shape), np.float32)
+    weight = np.zeros_like(inverse)
+    support = np.tile(np.arange(sure.size, dtype=np.int32).reshape(sure.shape), (len(KINDS), 1, 1))
+    trust = np.maximum(own.confidence, np.where(sure, LENT_CONFIDENCE, np.float32(0)))
+    votes = np.where(known_inverse_depth > 0, trust, 0).astype(np.float64) ** _EVIDENCE_POWER
+    inverse[0], votes_there = local_planes(known_inverse_depth.astype(np.float64), votes, own.image)
+    weight[0], support[0] = np.minimum(1, np.log1p(1e3 * votes_there) / 8), _nearest(sure)
+    inverse[1], weight[1] = own.inverse, own.confidence
+    inverse[2], weight[2] = lent, np.minimum(mass / 4, 1)
+    inverse[11], weight[11] = cv2.medianBlur(own.inverse, 5), cv2.medianBlur(own.confidence, 5)
+    fade = math.exp(-1 / (_FADE * max(sure.shape)))
+    _walk_lines(values, fade, inverse, weight, support)
+    at = [np.ascontiguousarray(a.reshape(len(KINDS), -1)[:, pixels].T) for a in (inverse, weight)]
+    return Candidates(pixels, at[0], np.ascontiguousarray(support.reshape(len(KINDS), -1)[:, pixels].T), at[1])
+
+
+def _nearest(sure: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """(h, w) flat index of the nearest sure pixel; 0 where there is none at all."""
+    if not sure.any():
+        return np.zeros(sure.shape, np.int32)
+    _, label = cv2.distanceTransformWithLabels(
+        (~sure).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    place = np.zeros(int(label.max()) + 1, np.int32)
+    place[label[sure]] = np.flatnonzero(sure)
+    return np.asarray(place[label], np.int32)
+
+
+@kernel
+def _walk_lines(
+    values: Array,
+    fade: float,
+    inverse: Array,
+    weight: Array,
+    support: NDArray[np.int32],
+) -> None:
+    """Along rows and columns both ways: the last sure value (kinds 3 to 6), and the line through those before it on the
+    same surface (7 to 10)."""
+    height, width = values.shape
+    for way in range(4):
+        upright = way >= 2
+        lines, steps = (width, height) if upright else (height, width)
+        for line in range(lines):
+            n, sx, sy, sxx, sxy = 0.0, 0.0, 0.0, 0.0, 0.0
+            last, place = 0.0, 0
+            for step in range(steps):
+                s = steps - 1 - step if way % 2 else step
+                y, x = (s, line) if upright else (line, s)
+                # Places are counted from the pixel where the walk is.
+                sxx, sxy, sx = sxx - 2 * sx + n, sxy - sy, sx - n
+                n, sx, sy, sxx, sxy = n * fade, sx * fade, sy * fade, sxx * fade, sxy * fade
+                q = values[y, x]
+                guess = 0.0
+                if n > 0:
+                    mx, my = sx / n, sy / n
+                    slope = (sxy / n - mx * my) / (sxx / n - mx * mx + _FLAT)
+                    guess = my - slope * mx
+                if q > 0:
+                    if n > 0 and abs(guess / q - 1) > _STEP:
+                        n, sx, sy, sxx, sxy = 0.0, 0.0, 0.0, 0.0, 0.0
+                    n, sy = n + 1, sy + q
+                    last, place, guess = float(q), y * width + x, float(q)
+                if last > 0:
+                    inverse[3 + way, y, x], inverse[7 + way, y, x] = last, max(guess, 0.0)
+                    weight[3 + way, y, x] = weight[7 + way, y, x] = min(n / 10, 1.0)
+                    support[3 + way, y, x] = support[7 + way, y, x] = place
+
+
+@dataclass(frozen=True)
+class CompletionInputs:
     """Basis of a completion: candidates and evidence (P, K, F) of the pixels that are not `sure` (h, w), by their
     own match or by inverse depths that are lent (h, w)."""
 
-    own: Half
+    own: HalfResKeyframe
     lent: Array
     sure: NDArray[np.bool_]
     found: Candidates
@@ -40,19 +158,22 @@ class Case:
     place: Bytes
 
     @property
-    def borrowed(self) -> NDArray[np.bool_]:
+    def from_other_views(self) -> NDArray[np.bool_]:
         """(h, w) where others are sure and the keyframe is not."""
         return self.sure & (self.own.confidence < SURE)
 
     @property
-    def spoken(self) -> Array:
+    def known_inverse_depth(self) -> Array:
         """(h, w) inverse depth where it is sure, own or borrowed; 0 elsewhere."""
-        return np.where(self.borrowed | (self.own.confidence <= 0), self.lent, self.own.inverse) * self.sure
+        return np.where(self.from_other_views | (self.own.confidence <= 0), self.lent, self.own.inverse) * self.sure
 
 
-def gather_case(
-    own: Half, lenders: list[Half], lent: list[NDArray[np.float64]], asked: list[NDArray[np.float64]]
-) -> Case | None:
+def build_inputs(
+    own: HalfResKeyframe,
+    lenders: list[HalfResKeyframe],
+    lent: list[NDArray[np.float64]],
+    asked: list[NDArray[np.float64]],
+) -> CompletionInputs | None:
     """Gather all that the completion of a keyframe rests on; None with hardly any sure pixel.
 
     `lent` (3, 4) lead from the lenders' pixels to the keyframe's, `asked` back from it to those of the first of them.
@@ -69,27 +190,29 @@ def gather_case(
     found = find_candidates(own, borrowed, mass, sure)
     evidence = np.empty((*found.inverse.shape, OF_CANDIDATE), np.uint8)
     _weigh_support(found.pixels, found.support, found.weight, own.lab, evidence)
-    case = Case(own, borrowed, sure, found, evidence, _describe_places(found.pixels, own, mass, sure))
-    return ask_again(case, lenders[:ASKED], asked)
+    inputs = CompletionInputs(own, borrowed, sure, found, evidence, _describe_places(found.pixels, own, mass, sure))
+    return update_view_evidence(inputs, lenders[:ASKED], asked)
 
 
-def ask_again(case: Case, views: list[Half], warps: list[NDArray[np.float64]]) -> Case:
-    """Return the case with what the views say of its candidates, nothing where there are none; warps (3, 4) lead from
+def update_view_evidence(
+    inputs: CompletionInputs, views: list[HalfResKeyframe], warps: list[NDArray[np.float64]]
+) -> CompletionInputs:
+    """Return the inputs with what the views say of its candidates, nothing where there are none; warps (3, 4) lead from
     the keyframe's pixels to theirs."""
-    evidence, own = case.evidence.copy(), case.own
+    evidence, own = inputs.evidence.copy(), inputs.own
     if views:
-        _ask_views(case.found.pixels, case.found.inverse, own.lab, *_stacked(views), np.stack(warps), evidence)
+        _ask_views(inputs.found.pixels, inputs.found.inverse, own.lab, *_stacked(views), np.stack(warps), evidence)
     else:
         evidence[..., 3:] = _NOTHING
-    return replace(case, evidence=evidence)
+    return replace(inputs, evidence=evidence)
 
 
-def _stacked(views: list[Half]) -> tuple[Array, Array, Array]:
+def _stacked(views: list[HalfResKeyframe]) -> tuple[Array, Array, Array]:
     inverse, confidence, lab = ([getattr(v, name) for v in views] for name in ("inverse", "confidence", "lab"))
     return np.stack(inverse), np.stack(confidence), np.stack(lab)
 
 
-def _describe_places(pixels: NDArray[np.int64], own: Half, mass: Array, sure: NDArray[np.bool_]) -> Bytes:
+def _describe_places(pixels: NDArray[np.int64], own: HalfResKeyframe, mass: Array, sure: NDArray[np.bool_]) -> Bytes:
     """Return (P, OF_PLACE) for flat indices (P,); mass and sure (h, w) as of `find_candidates`: confidence of the
     match, agreement of others, distance to what is sure, contrast, roughness and density of the matches around."""
     far = cv2.distanceTransform((~sure).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)

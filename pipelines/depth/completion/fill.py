@@ -24,9 +24,9 @@ Array = NDArray[np.float64]
 
 SURE = 0.3
 """Confidence from which a depth is evidence and stays as it is."""
-_COMPANY_REACH, _COMPANY_SD = 3 / 80, 30.0
+_SMOOTH_REACH, _SMOOTH_SD = 3 / 80, 30.0
 """As a part of the longer side; colours."""
-_COMPANY_POWER = 0.9
+_SMOOTH_POWER = 0.9
 """Brings the calibration: from confidence 0.42 (reliability 0.5) on, at most 3 % are off by more than 5 %."""
 _REACHES = ((1 / 16, 30.0, 1.0), (1 / 4, 60.0, 0.1))
 """How far a depth speaks along like colours (as a part of the longer side), the colour step that stops it, and how much
@@ -44,8 +44,8 @@ _FACTORS = 9
 def smooth_confidence(confidence: NDArray[np.float32], image: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(h, w) confidence that also counts how sure the pixels around are that have a like colour; image (h, w, 3)."""
     both = np.stack([confidence, np.ones_like(confidence)], axis=-1)
-    total, mass = np.moveaxis(spread_votes(both, image, _COMPANY_REACH * max(confidence.shape), _COMPANY_SD), -1, 0)
-    return np.power(confidence * np.clip(total / mass, 0, 1), _COMPANY_POWER).astype(np.float32)
+    total, mass = np.moveaxis(domain_transform(both, image, _SMOOTH_REACH * max(confidence.shape), _SMOOTH_SD), -1, 0)
+    return np.power(confidence * np.clip(total / mass, 0, 1), _SMOOTH_POWER).astype(np.float32)
 
 
 def evidence_of(contrast: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -60,7 +60,7 @@ def local_planes(inverse: Array, weight: Array, image: NDArray[np.uint8]) -> tup
     votes, sums = np.empty((*inverse.shape, _FACTORS), np.float32), np.zeros((*inverse.shape, _FACTORS))
     _write_votes(inverse, weight, side, votes)
     for reach, color_sd, share in _REACHES:
-        _add(share, spread_votes(votes, image, reach * side, color_sd), sums)
+        _add(share, domain_transform(votes, image, reach * side, color_sd), sums)
     mass = sums[..., 0].copy()
     for k in range(_FACTORS):
         votes[..., k] = _spread_anywhere(votes[..., k])
@@ -204,18 +204,20 @@ def _agree(
     return found, mass
 
 
-def spread_votes(
+def domain_transform(
     votes: NDArray[np.float32], image: NDArray[np.uint8], reach: float, color_sd: float
 ) -> NDArray[np.float32]:
     """(h, w, C) votes smoothed along the image (h, w, 3) by the domain transform (Gastal and Oliveira, SIGGRAPH 2011):
     a vote fades over `reach` pixels of like colour, and faster where the colour changes by about `color_sd`."""
     out = np.array(votes, np.float32, order="C")
-    spread_in_place(out, image, reach, color_sd)
+    domain_transform_in_place(out, image, reach, color_sd)
     return out
 
 
-def spread_in_place(votes: NDArray[np.float32], image: NDArray[np.uint8], reach: float, color_sd: float) -> None:
-    """Do what `spread_votes` does to votes that nobody else has, without a second copy of all classes."""
+def domain_transform_in_place(
+    votes: NDArray[np.float32], image: NDArray[np.uint8], reach: float, color_sd: float
+) -> None:
+    """Do what `domain_transform` does to votes that nobody else has, without a second copy of all classes."""
     across, down = (_color_steps(image, axis) for axis in (1, 0))
     for iteration in range(2):
         fade = np.exp(-np.sqrt(2.0) / (reach * 0.5**iteration))

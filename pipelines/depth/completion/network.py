@@ -22,8 +22,18 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from ....formats.tensors import load_arrays
 from ...geometry.voxels import to_lab
-from .candidates import KINDS, LENT_CONFIDENCE, Array, Half, invert
-from .evidence import FEATURES, LEAST_NUMBER, OF_CANDIDATE, STEP_OF_NUMBERS, Case
+from .evidence import (
+    FEATURES,
+    KINDS,
+    LEAST_NUMBER,
+    LENT_CONFIDENCE,
+    OF_CANDIDATE,
+    STEP_OF_NUMBERS,
+    Array,
+    CompletionInputs,
+    HalfResKeyframe,
+    invert,
+)
 from .fill import SURE
 
 WEIGHTS = Path(__file__).parent / "weights.npz"
@@ -36,7 +46,7 @@ _MOST_CORRECTION = 0.2
 """Log depth by which a candidate is moved at most."""
 _NEVER = -30.0
 _ALIKE = 0.02
-_SOFTENED = 2.0
+_TEMPERATURE = 2.0
 """Log probabilities are divided by it: a network is surer of made rooms, which it learned, than of others."""
 _BLOCK = 1024
 """Pixels whose candidates are read at once."""
@@ -44,9 +54,9 @@ _BLOCK = 1024
 
 @dataclass(frozen=True)
 class Inputs:
-    """Inputs of one keyframe: planes (10, h, w); of the P pixels that are not sure, flat indices (P,), evidence of
-    their candidates (P, K, OF_CANDIDATE) and places (P, OF_PLACE) as of `Case`, which candidates there are (P, K) and
-    their log inverse depths (P, K) over the keyframe's median, whose logarithm is `reference`."""
+    """What the network reads of one keyframe: planes (10, h, w); of the P unsure pixels flat indices (P,), evidence of
+    their candidates (P, K, OF_CANDIDATE) and places (P, OF_PLACE) as of `CompletionInputs`, which candidates there are
+    (P, K) and their log inverse depths (P, K) over the keyframe's median, whose logarithm is `reference`."""
 
     planes: Tensor
     pixels: Tensor
@@ -65,23 +75,23 @@ class Mixture:
     log_share: Tensor
     logs: Tensor
     log_spread: Tensor
-    log_doubt: Tensor
+    log_scale_known: Tensor
 
 
-def inputs_of(case: Case, device: str = "cpu") -> Inputs:
-    """Bring a keyframe's case to the network's inputs."""
-    own, sure, spoken = case.own, case.sure, case.spoken
-    reference = float(np.log(_lower_median(spoken[spoken > 0])))
+def inputs_of(inputs: CompletionInputs, device: str = "cpu") -> Inputs:
+    """Bring a keyframe's inputs to the network's form."""
+    own, sure, known_inverse_depth = inputs.own, inputs.sure, inputs.known_inverse_depth
+    reference = float(np.log(_lower_median(known_inverse_depth[known_inverse_depth > 0])))
     colors = own.lab / np.array([50, 30, 30], np.float32) - np.array([1, 0, 0], np.float32)
-    relative = (_relative(spoken, reference), _relative(own.inverse, reference))
+    relative = (_relative(known_inverse_depth, reference), _relative(own.inverse, reference))
     planes = np.stack([
         *np.moveaxis(colors, -1, 0), *relative, own.inverse > 0, own.confidence, sure,
-        _relative(case.lent, reference), np.log10(own.contrast + 1e-7) / 4 + 1,
+        _relative(inputs.lent, reference), np.log10(own.contrast + 1e-7) / 4 + 1,
     ]).astype(np.float32)  # fmt: skip
-    inverse = case.found.inverse
+    inverse = inputs.found.inverse
     real = inverse > 0
     logs = np.where(real, np.log(np.maximum(inverse, 1e-9)) - np.float32(reference), np.float32(0))
-    arrays = (planes, case.found.pixels, case.evidence, case.place, real, logs)
+    arrays = (planes, inputs.found.pixels, inputs.evidence, inputs.place, real, logs)
     planes_, pixels, evidence, place, there, of = (torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays)
     return Inputs(planes_, pixels, evidence, place, there, of, reference)
 
@@ -203,11 +213,11 @@ class CompletionNetwork(nn.Module):
         parts = [self.weigh(h, given.real[b], g, context[b]) for h, g, b in zip(read, gathered, blocks, strict=True)]
         share, moved, spread = (torch.cat(column) for column in zip(*parts, strict=True))
         logs = torch.cat([given.logs, given.logs[:, :1]], 1) + moved
-        return Mixture(torch.log_softmax(share / _SOFTENED, 1), logs, spread, around[..., -1].float().clamp(-5.8, 0))
+        return Mixture(torch.log_softmax(share / _TEMPERATURE, 1), logs, spread, around[..., -1].float().clamp(-5.8, 0))
 
 
 @torch.no_grad()
-def middle_of(found: Mixture) -> tuple[Tensor, Tensor]:
+def mixture_median(found: Mixture) -> tuple[Tensor, Tensor]:
     """Return the weighted median (P,) of each pixel's log inverse depth, which has the least expected error, and that
     error (P,), at most 1."""
     share = found.log_share.exp()
@@ -251,7 +261,7 @@ HALF, TWICE = np.diag([0.5, 0.5, 1]), np.diag([2.0, 2, 1, 1])
 """Bring a warp between pictures to half their size."""
 
 
-def halved(depth: Array, confidence: Array, image: NDArray[np.uint8], contrast: Array) -> Half:
+def halved(depth: Array, confidence: Array, image: NDArray[np.uint8], contrast: Array) -> HalfResKeyframe:
     """Reduce depth, confidence and contrast (H, W) to the size of the image (H/2, W/2, 3), both rounded up."""
     height, width = image.shape[:2]
     pad = ((0, 2 * height - depth.shape[0]), (0, 2 * width - depth.shape[1]))
@@ -262,33 +272,33 @@ def halved(depth: Array, confidence: Array, image: NDArray[np.uint8], contrast: 
     best = blocks[1].argmax(-1)[..., None]
     found, sure = (np.take_along_axis(b, best, -1)[..., 0] for b in blocks)
     small = np.asarray(cv2.resize(contrast, (width, height), interpolation=cv2.INTER_AREA), np.float32)
-    return Half(invert(found), sure.astype(np.float32), image, to_lab(image), small)
+    return HalfResKeyframe(invert(found), sure.astype(np.float32), image, to_lab(image), small)
 
 
-def complete(case: Case, device: str) -> tuple[Array, Array]:
+def complete(inputs: CompletionInputs, device: str) -> tuple[Array, Array]:
     """Return depth (h, w) at half the size, own, borrowed or completed, and its expected error in log depth (h, w)."""
-    inverse = np.where(case.borrowed, case.lent, case.own.inverse)
-    given = inputs_of(case, device)
+    inverse = np.where(inputs.from_other_views, inputs.lent, inputs.own.inverse)
+    given = inputs_of(inputs, device)
     found = weigh_candidates(given, device)
-    error = np.exp(found.log_doubt.cpu().numpy())
-    if len(case.found.pixels):
-        logs, risk = (x.cpu().numpy() for x in middle_of(found))
-        inverse.ravel()[case.found.pixels] = np.exp(logs + np.float32(given.reference))
+    error = np.exp(found.log_scale_known.cpu().numpy())
+    if len(inputs.found.pixels):
+        logs, risk = (x.cpu().numpy() for x in mixture_median(found))
+        inverse.ravel()[inputs.found.pixels] = np.exp(logs + np.float32(given.reference))
         smooth = cv2.bilateralFilter(np.log(np.maximum(inverse, 1e-9)), -1, _LIKE_DEPTH, max(inverse.shape) * _SMOOTHED)
-        inverse = np.where(case.sure, inverse, np.exp(smooth))
-        error.ravel()[case.found.pixels] = risk
+        inverse = np.where(inputs.sure, inverse, np.exp(smooth))
+        error.ravel()[inputs.found.pixels] = risk
     return invert(inverse), error
 
 
-def trusted(case: Case, error: Array) -> Array:
+def to_confidence(inputs: CompletionInputs, error: Array) -> Array:
     """Return (h, w) confidence at half the size: of what is not sure by its expected error alone."""
-    sure = np.where(case.borrowed, LENT_CONFIDENCE, case.own.confidence)
-    return np.where(case.sure, sure, _MOST_CONFIDENCE * np.exp(-error / _FADING)).astype(np.float32)
+    sure = np.where(inputs.from_other_views, LENT_CONFIDENCE, inputs.own.confidence)
+    return np.where(inputs.sure, sure, _MOST_CONFIDENCE * np.exp(-error / _FADING)).astype(np.float32)
 
 
-def as_completed(case: Case, device: str) -> Half:
+def completed_keyframe(inputs: CompletionInputs, device: str) -> HalfResKeyframe:
     """Return the keyframe as others may ask it: what is not its own is unsure, however good."""
-    depth, error = complete(case, device)
-    mine = case.own.confidence >= SURE
-    unsure = np.minimum(trusted(case, error), np.float32(_MOST_CONFIDENCE))
-    return replace(case.own, inverse=invert(depth), confidence=np.where(mine, case.own.confidence, unsure))
+    depth, error = complete(inputs, device)
+    mine = inputs.own.confidence >= SURE
+    unsure = np.minimum(to_confidence(inputs, error), np.float32(_MOST_CONFIDENCE))
+    return replace(inputs.own, inverse=invert(depth), confidence=np.where(mine, inputs.own.confidence, unsure))

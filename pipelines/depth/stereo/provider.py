@@ -22,10 +22,18 @@ from ...system.parallel import LruCache, map_lookahead
 from ...system.progress import Progress
 from ...system.values import load_value, save_value
 from ...types import Frame, Intrinsics
-from ..completion.candidates import LENT_CONFIDENCE, Half, invert
-from ..completion.evidence import ASKED, LENDERS, Case, ask_again, gather_case
+from ..completion.evidence import (
+    ASKED,
+    LENDERS,
+    LENT_CONFIDENCE,
+    CompletionInputs,
+    HalfResKeyframe,
+    build_inputs,
+    invert,
+    update_view_evidence,
+)
 from ..completion.fill import SURE, evidence_of, smooth_confidence
-from ..completion.network import HALF, TWICE, as_completed, complete, halved, trusted
+from ..completion.network import HALF, TWICE, complete, completed_keyframe, halved, to_confidence
 from .consistency import choose_neighbours, depth_range, fuse_depths
 from .matching import StereoImages, match_planes
 from .sweep import warps_to
@@ -86,7 +94,7 @@ class MultiviewDepth:
         self._small = LruCache(self._read_small, _CACHED_FRAMES)
         self._contrast = LruCache(self._measure_contrast, _CACHED_LENDERS)
         self._half = LruCache(self._halve, _CACHED_LENDERS)
-        self.first_case = LruCache(self._gather, _CACHED_CASES)
+        self.first_inputs = LruCache(self._first_inputs, _CACHED_CASES)
         self._completed = LruCache(self._complete_first, _CACHED_LENDERS)
         self._nearest = LruCache(self._choose_nearest, _CACHED_FRAMES)
 
@@ -97,16 +105,16 @@ class MultiviewDepth:
     # first pass -------------------------------------------------------------------------------------------------
 
     def fit(self, frames: list[Frame]) -> None:
-        """Look at all: nothing is found out of them together."""
+        """Compute the raw depth of every keyframe; there is no joint step."""
         self.precompute(frames)
 
     def precompute(self, frames: list[Frame]) -> None:
         """A raw depth map of every keyframe, on disk."""
         known = [f for f in frames if f.id in self._index]
-        for _ in self._progress.track(map_lookahead(self._look_at, known, self._threads), "stereo", len(known)):
+        for _ in self._progress.track(map_lookahead(self._compute_raw, known, self._threads), "stereo", len(known)):
             pass
 
-    def _look_at(self, frame: Frame) -> None:
+    def _compute_raw(self, frame: Frame) -> None:
         if not (path := self._path(frame.id)).exists():
             save_value(path, self._sweep(self._index[frame.id]))
 
@@ -118,8 +126,8 @@ class MultiviewDepth:
         if len(companions) == 0 or limits is None:
             return np.zeros((camera.height, camera.width), np.float32)
         planes = np.linspace(1 / limits[1], 1 / limits[0], self._planes)
-        given, card = (self._stereo_images(index, companions), planes), self._card
-        inverse = match_planes(*given, self._bands) if card is None else card.match_planes(*given, self._device)
+        given, cuda = (self._stereo_images(index, companions), planes), self._cuda
+        inverse = match_planes(*given, self._bands) if cuda is None else cuda.match_planes(*given, self._device)
         left_out = self._grey(int(self._model.frame_ids[index]))[1]
         inverse = np.clip(inverse, planes[0], planes[-1]).astype(np.float32)
         unknown = at_stops(inverse, planes)
@@ -142,38 +150,38 @@ class MultiviewDepth:
 
     def _complete(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth and confidence of one keyframe at the size that is matched, completed where it is not sure itself."""
-        (depth, confidence), case = self._fused(index), self.case(index)
-        if case is None:
+        (depth, confidence), inputs = self._fused(index), self.inputs(index)
+        if inputs is None:
             return depth, np.minimum(confidence, SURE)
-        small, error = complete(case, self._network_device)
-        found, sure = upsample_depth(small, trusted(case, error), self._small(index)), confidence >= SURE
+        small, error = complete(inputs, self._network_device)
+        found, sure = upsample_depth(small, to_confidence(inputs, error), self._small(index)), confidence >= SURE
         trust = np.where(sure, confidence, np.minimum(found.confidence, LENT_CONFIDENCE))
         return np.where(sure, depth, found.depth), trust
 
-    def case(self, index: int) -> Case | None:
+    def inputs(self, index: int) -> CompletionInputs | None:
         """Gather what the completion of a keyframe's depth rests on, by its place in the backbone: other keyframes are
         asked again, completed. None with hardly any sure pixel."""
-        first = self.first_case(index)
+        first = self.first_inputs(index)
         if first is None:
             return None
         asked = self._lenders(index)[:ASKED]
-        return ask_again(first, [self._completed(j) for j in asked.tolist()], self._half_warps(index, asked))
+        return update_view_evidence(first, [self._completed(j) for j in asked.tolist()], self._half_warps(index, asked))
 
-    def _gather(self, index: int) -> Case | None:
-        """Do the same from what keyframes know by themselves."""
+    def _first_inputs(self, index: int) -> CompletionInputs | None:
+        """Gather first-round inputs, from uncompleted neighbours."""
         lenders = self._lenders(index)
         lent = [self._half_warps(j, np.array([index]))[0] for j in lenders.tolist()]
         halves = [self._half(j) for j in lenders.tolist()]
-        return gather_case(self._half(index), halves, lent, self._half_warps(index, lenders[:ASKED]))
+        return build_inputs(self._half(index), halves, lent, self._half_warps(index, lenders[:ASKED]))
 
-    def _complete_first(self, index: int) -> Half:
-        case = self.first_case(index)
-        return self._half(index) if case is None else as_completed(case, self._network_device)
+    def _complete_first(self, index: int) -> HalfResKeyframe:
+        inputs = self.first_inputs(index)
+        return self._half(index) if inputs is None else completed_keyframe(inputs, self._network_device)
 
     def _half_warps(self, index: int, others: NDArray[np.int64]) -> list[NDArray[np.float64]]:
         return [HALF @ warp @ TWICE for warp in self._warps(index, others)]
 
-    def _halve(self, index: int) -> Half:
+    def _halve(self, index: int) -> HalfResKeyframe:
         size = -(-self.camera.width // 2), -(-self.camera.height // 2)
         return halved(*self._fused(index), resize_area(self._small(index), *size), self._contrast(index))
 
@@ -214,8 +222,8 @@ class MultiviewDepth:
         tolerance: float,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Compare as `fuse_depths` does, on the device."""
-        given, card = (depth, others, warps, back, tolerance), self._card
-        return fuse_depths(*given, self._bands) if card is None else card.fuse_depths(*given, self._device)
+        given, cuda = (depth, others, warps, back, tolerance), self._cuda
+        return fuse_depths(*given, self._bands) if cuda is None else cuda.fuse_depths(*given, self._device)
 
     def figures(self) -> dict[str, Any]:
         """The size that the images were matched at."""
@@ -225,14 +233,14 @@ class MultiviewDepth:
 
     @property
     def _network_device(self) -> str:
-        return "cpu" if self._card is None else self._device
+        return "cpu" if self._cuda is None else self._device
 
     @cached_property
-    def _card(self) -> ModuleType | None:
+    def _cuda(self) -> ModuleType | None:
         """The same by kernels where the device takes them."""
         if self._device == "cpu":
             return None
-        from . import card  # imports torch
+        from . import cuda as card
 
         return card if card.takes_kernels_on(self._device) else None
 

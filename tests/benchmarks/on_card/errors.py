@@ -10,7 +10,7 @@ from torch import Tensor
 
 import msgs_slam.pipelines.depth.stereo.matching as matching
 from msgs_slam.pipelines.compute.adam import descend
-from msgs_slam.pipelines.depth.stereo import card
+from msgs_slam.pipelines.depth.stereo import cuda
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.depth.stereo.sweep import refine_inverse_depth, sweep_cost
 from msgs_slam.pipelines.depth.stereo.volume import Bands, smooth_cost
@@ -200,16 +200,16 @@ def errors_of_stereo(rows: Rows) -> None:
         _stereo_steps(rows, scene, bands)
     with rows.attempt("match"):
         exact = matching.match_planes(scene.images, scene.planes, bands)
-        agree(rows, "stereo", "match", card.match_planes(scene.images, scene.planes, CARD.device), exact, pixels=True)
+        agree(rows, "stereo", "match", cuda.match_planes(scene.images, scene.planes, CARD.device), exact, pixels=True)
     with rows.attempt("fusing"):
         given = (scene.depth, scene.others, scene.warps, scene.back, 0.01)
-        found = (card.fuse_depths(*given, CARD.device), fuse_depths(*given, bands))
+        found = (cuda.fuse_depths(*given, CARD.device), fuse_depths(*given, bands))
         for of, ours, theirs in zip(("fused depth", "support", "conflict"), *found, strict=True):
             agree(rows, "stereo", of, ours, theirs, pixels=True)
 
 
 def _stereo_steps(rows: Rows, scene: StereoScene, bands: Bands) -> None:
-    on_card, best = card.Matching.of(scene.images, CARD.device), matching.best_count(len(scene.images.others))
+    on_card, best = cuda.Matching.of(scene.images, CARD.device), matching.best_count(len(scene.images.others))
     cost = on_card.cost(scene.planes)
     exact = to_dense(sweep_cost(*scene.images, scene.planes, best, bands))
     agree(rows, "stereo", "costs", cost, exact, pixels=True)

@@ -11,7 +11,7 @@ from renderer import POSE, Case
 
 import msgs_slam.pipelines.depth.stereo.matching as matching
 from msgs_slam.pipelines.compute.threads import get_threads
-from msgs_slam.pipelines.depth.stereo import card
+from msgs_slam.pipelines.depth.stereo import cuda
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.depth.stereo.volume import Bands
 from msgs_slam.pipelines.render.api import render
@@ -81,8 +81,8 @@ def time_stereo(rows: Rows) -> None:
     given = (scene.depth, scene.others, scene.warps, scene.back, 0.01)
     with rows.attempt("stereo on the card"):
         match, fuse = (
-            lambda: card.match_planes(scene.images, scene.planes, CARD.device),
-            lambda: card.fuse_depths(*given, CARD.device),
+            lambda: cuda.match_planes(scene.images, scene.planes, CARD.device),
+            lambda: cuda.fuse_depths(*given, CARD.device),
         )
         _add(rows, case, "match", CARD, match)
         _add(rows, case, "fuse", CARD, fuse)

@@ -115,7 +115,7 @@ def measure(folder: Path, seeds: list[int], name: str, network: float, alone: bo
 
 def expected_error(provider: MultiviewDepth, index: int, size: tuple[int, ...]) -> NDArray[np.float32]:
     """(h, w) what the stereo expects of the error of a keyframe's log depth; 1 where it completes nothing."""
-    case = provider.case(index)
+    case = provider.inputs(index)
     return resample_nearest(complete(case, "cpu")[1], *size) if case is not None else np.ones(size, np.float32)
 
 
@@ -175,10 +175,10 @@ def figures(depth: NDArray, expected: NDArray, truth: NDArray, unsure: NDArray) 
     shown = np.where(depth > 0, depth, 1e-3)
     error = np.minimum(np.abs(np.log(shown[known] / truth[known])), 1)
     metres, off, guess = np.abs(depth - truth)[known], error > np.log(1 + OFF), unsure[known]
-    sure, trusted = ~guess, expected[known] < 0.02
+    sure, to_confidence = ~guess, expected[known] < 0.02
     shares = [100 * guess.mean(), 100 * metres.mean(), 100 * off.mean(), 100 * off[sure].mean()]
     guesses, of_median = [100 * error[guess].mean(), 100 * off[guess].mean()], metres.mean() / np.median(truth[known])
-    return (*shares, *guesses, 100 * off[trusted].mean(), 100 * trusted.mean(), 100 * of_median)
+    return (*shares, *guesses, 100 * off[to_confidence].mean(), 100 * to_confidence.mean(), 100 * of_median)
 
 
 def _print(title: str, rows: list[dict[str, NDArray]], summary: object) -> None:

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from msgs_slam.formats.tensors import load_arrays, save_arrays
-from msgs_slam.pipelines.depth.completion.candidates import KINDS
-from msgs_slam.pipelines.depth.completion.evidence import Case
+from msgs_slam.pipelines.depth.completion.evidence import KINDS, CompletionInputs
 from msgs_slam.pipelines.depth.completion.fill import SURE
 from msgs_slam.pipelines.depth.completion.network import CompletionNetwork, Inputs, compare, inputs_of, numbers_of
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
@@ -66,7 +65,7 @@ def half_truth(depth: NDArray) -> Array:
     return np.asarray(middle, np.float32)
 
 
-def room_cases(seed: int, folder: Path, device: str = "cpu") -> list[tuple[Case, Array]]:
+def room_cases(seed: int, folder: Path, device: str = "cpu") -> list[tuple[CompletionInputs, Array]]:
     """Film the room of a seed, three of five by a worse camera, and gather the cases of its keyframes, by the stereo on
     a device, with the true depth (h, w) at half the size; none where there is no place to walk."""
     rng, as_worn = np.random.default_rng(seed + 5), seed % 5 in (1, 2, 3)
@@ -80,7 +79,7 @@ def room_cases(seed: int, folder: Path, device: str = "cpu") -> list[tuple[Case,
         if (as_worn or seed % 5 == 4) and rng.random() < 0.75:
             _match_falsely(provider, seed)
         kept = np.sort(rng.permutation(len(frames))[:_KEPT])
-        cases = [provider.case(k) if rng.random() < _AGAIN else provider.first_case(k) for k in kept.tolist()]
+        cases = [provider.inputs(k) if rng.random() < _AGAIN else provider.first_inputs(k) for k in kept.tolist()]
     finally:
         shutil.rmtree(maps, ignore_errors=True)
     truths = [half_truth(clip.truth[k]) for k in kept]
@@ -91,7 +90,7 @@ def room_cases(seed: int, folder: Path, device: str = "cpu") -> list[tuple[Case,
     ]
 
 
-def _scaled(case: Case, truth: Array) -> Array:
+def _scaled(case: CompletionInputs, truth: Array) -> Array:
     """The truth in the unit of the stereo: one scale for each view, as a run has one."""
     sure = (case.own.confidence >= SURE) & (truth > 0)
     return np.asarray(truth / np.median((truth * case.own.inverse)[sure]), np.float32) if sure.any() else truth * 0
@@ -167,12 +166,12 @@ class Example:
         return replace(self, given=turned, sure_error=self.sure_error.flip(1))
 
 
-def example_arrays(case: Case, truth: Array) -> dict[str, NDArray]:
+def example_arrays(case: CompletionInputs, truth: Array) -> dict[str, NDArray]:
     """Return what is kept of a case and its true depth (h, w)."""
     given = inputs_of(case)
-    known, at, spoken = truth > 0, case.found.pixels, case.spoken
+    known, at, known_inverse_depth = truth > 0, case.found.pixels, case.known_inverse_depth
     wanted = -np.log(np.maximum(truth, 1e-6)) - np.float32(given.reference)
-    relative = np.log(np.maximum(spoken, 1e-9)) - np.float32(given.reference)
+    relative = np.log(np.maximum(known_inverse_depth, 1e-9)) - np.float32(given.reference)
     logs, of_pixel = given.logs.numpy().clip(-6, 6), np.where(known, wanted, np.float32(np.nan)).ravel()[at]
     fill = np.abs(logs[:, 0] - of_pixel).clip(max=1)
     return {
@@ -183,7 +182,7 @@ def example_arrays(case: Case, truth: Array) -> dict[str, NDArray]:
         "real": given.real.numpy(),
         "logs": logs.astype(np.float16),
         "wanted": of_pixel.clip(-6, 6),
-        "sure_error": np.where(known & (spoken > 0), relative - wanted, _UNKNOWN).astype(np.float16),
+        "sure_error": np.where(known & (known_inverse_depth > 0), relative - wanted, _UNKNOWN).astype(np.float16),
         "weight": np.array(1 / (np.nanmean(fill) + 0.08)),
     }
 
@@ -371,9 +370,9 @@ def loss_of(network: CompletionNetwork, batch: list[Example]) -> Tensor:
     unlikely = -torch.logsumexp(share - apart.clamp(max=2) / log_spread.exp() - log_spread, 1)
     expected = (share.exp() * apart.clamp(max=1)).sum(1)
     total = (counted * (unlikely + _RISK * expected)).sum() / counted.sum().clamp(min=1)
-    off, log_doubt = torch.stack([e.sure_error for e in batch]).float(), around[..., -1].float().clamp(-5.8, 0)
+    off, log_scale_known = torch.stack([e.sure_error for e in batch]).float(), around[..., -1].float().clamp(-5.8, 0)
     there = (off < _UNKNOWN / 2).float()
-    unlikely = off.abs().clamp(max=0.5) / log_doubt.exp() + log_doubt
+    unlikely = off.abs().clamp(max=0.5) / log_scale_known.exp() + log_scale_known
     return total + _DOUBT * (unlikely * there).sum() / there.sum().clamp(min=1)
 
 

@@ -10,22 +10,28 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.tensors import load_arrays, save_arrays
 from msgs_slam.pipelines.depth.completion import network as rooms_network
-from msgs_slam.pipelines.depth.completion.candidates import KINDS, Half
-from msgs_slam.pipelines.depth.completion.evidence import STEP_OF_NUMBERS, Case, ask_again, gather_case
+from msgs_slam.pipelines.depth.completion.evidence import (
+    KINDS,
+    STEP_OF_NUMBERS,
+    CompletionInputs,
+    HalfResKeyframe,
+    build_inputs,
+    update_view_evidence,
+)
 from msgs_slam.pipelines.depth.completion.fill import SURE, agreed_depth, carry_depth, local_planes, smooth_confidence
 from msgs_slam.pipelines.depth.completion.network import (
     HALF,
     TWICE,
     CompletionNetwork,
     Mixture,
-    as_completed,
     complete,
+    completed_keyframe,
     halved,
     inputs_of,
     load_network,
-    middle_of,
+    mixture_median,
     numbers_of,
-    trusted,
+    to_confidence,
 )
 from msgs_slam.pipelines.depth.stereo.sweep import warps_to
 from msgs_slam.pipelines.depth.stereo.window import surface_contrast
@@ -144,7 +150,7 @@ def test_of_two_carried_depths_the_nearer_hides_the_other() -> None:
     assert set(np.unique(likeness)) <= {0.0, 1.0}
 
 
-def wall_views() -> tuple[Half, Half, list[NDArray], list[NDArray]]:
+def wall_views() -> tuple[HalfResKeyframe, HalfResKeyframe, list[NDArray], list[NDArray]]:
     """A textured plane with a blank middle, from two cameras: the middle is matched at random and unsure."""
     rng, halves = np.random.default_rng(7), []
     for pose in (MIDDLE, ASIDE):
@@ -162,9 +168,9 @@ def wall_views() -> tuple[Half, Half, list[NDArray], list[NDArray]]:
     return *halves, there, back
 
 
-def wall_case() -> Case:
+def wall_case() -> CompletionInputs:
     own, aside, there, back = wall_views()
-    case = gather_case(own, [aside], there, back)
+    case = build_inputs(own, [aside], there, back)
     assert case is not None
     return case
 
@@ -172,42 +178,44 @@ def wall_case() -> Case:
 def test_a_blank_part_of_a_wall_is_completed_as_a_wall() -> None:
     case, truth = wall_case(), plane_depth(MIDDLE).reshape(HEIGHT // 2, 2, WIDTH // 2, 2).mean((1, 3))
     depth, expected = complete(case, "cpu")
-    confidence, blank = trusted(case, expected), ~case.sure
+    confidence, blank = to_confidence(case, expected), ~case.sure
     assert blank.sum() > 100
     error = np.abs(np.log(depth / truth))
     assert error[blank].mean() < 0.3 * np.abs(np.log(case.own.inverse * truth))[blank].mean()
     assert error[blank].max() < 0.1
     np.testing.assert_array_equal(confidence[blank] < SURE, True)
-    np.testing.assert_allclose(depth[~blank & ~case.borrowed], 1 / case.own.inverse[~blank & ~case.borrowed], rtol=1e-6)
+    np.testing.assert_allclose(
+        depth[~blank & ~case.from_other_views], 1 / case.own.inverse[~blank & ~case.from_other_views], rtol=1e-6
+    )
 
 
 def test_keyframes_are_asked_again_once_they_are_completed() -> None:
     own, aside, there, back = wall_views()
-    case, other = gather_case(own, [aside], there, back), gather_case(aside, [own], back, there)
+    case, other = build_inputs(own, [aside], there, back), build_inputs(aside, [own], back, there)
     assert case is not None
     assert other is not None
-    known = as_completed(other, "cpu")
+    known = completed_keyframe(other, "cpu")
     assert (known.confidence[other.own.confidence < SURE] < SURE).all()
-    again = ask_again(case, [known], back)
+    again = update_view_evidence(case, [known], back)
     np.testing.assert_array_equal(again.evidence[..., :3], case.evidence[..., :3])
     assert again.place is case.place
     weakly_on = 6  # how many views have it there, unsurely
     assert again.evidence[:, 0, weakly_on].mean() > case.evidence[:, 0, weakly_on].mean() + 0.3 / STEP_OF_NUMBERS
-    assert (numbers_of(torch.from_numpy(ask_again(case, [], []).evidence[..., 3:])) == 0).all()
+    assert (numbers_of(torch.from_numpy(update_view_evidence(case, [], []).evidence[..., 3:])) == 0).all()
 
 
 def test_with_hardly_any_sure_pixel_there_is_nothing_to_complete_from() -> None:
     own, aside, there, back = wall_views()
-    doubtful = Half(own.inverse, own.confidence * 0.1, own.image, own.lab, own.contrast)
-    assert gather_case(doubtful, [aside], there, back) is None
+    doubtful = HalfResKeyframe(own.inverse, own.confidence * 0.1, own.image, own.lab, own.contrast)
+    assert build_inputs(doubtful, [aside], there, back) is None
 
 
 def test_a_keyframe_without_neighbours_is_completed_from_itself() -> None:
     own = wall_views()[0]
-    case = gather_case(own, [], [], [])
+    case = build_inputs(own, [], [], [])
     assert case is not None
     depth, expected = complete(case, "cpu")
-    confidence = trusted(case, expected)
+    confidence = to_confidence(case, expected)
     assert np.isfinite(depth).all()
     assert depth.min() > 0
     assert 0 <= confidence.min() <= confidence.max() <= 1
@@ -218,7 +226,7 @@ def test_the_middle_of_a_mixture_has_the_least_expected_error() -> None:
     share = rng.dirichlet(np.full(len(KINDS) + 1, 0.3), 50)
     logs, spread = rng.normal(size=share.shape) * 0.2, rng.uniform(0.01, 0.1, share.shape)
     mixture = Mixture(*(torch.from_numpy(a) for a in (np.log(share + 1e-12), logs, np.log(spread), np.zeros((1, 1)))))
-    middle, error = (x.numpy() for x in middle_of(mixture))
+    middle, error = (x.numpy() for x in mixture_median(mixture))
     samples = logs[:, None] + spread[:, None] * rng.laplace(size=(50, 4000, logs.shape[1]))
     for k in range(50):
         drawn = rng.choice(logs.shape[1], 4000, p=share[k])
@@ -238,9 +246,9 @@ def test_pixels_in_blocks_are_weighed_like_all_at_once(monkeypatch: pytest.Monke
 
 def test_the_network_knows_no_unit_of_depth() -> None:
     own, aside, there, back = wall_views()
-    far = [Half(h.inverse / 8, h.confidence, h.image, h.lab, h.contrast) for h in (own, aside)]
+    far = [HalfResKeyframe(h.inverse / 8, h.confidence, h.image, h.lab, h.contrast) for h in (own, aside)]
     grown = [w * np.array([1, 1, 1, 8.0]) for w in (there[0], back[0])]
-    near, distant = gather_case(own, [aside], there, back), gather_case(far[0], [far[1]], [grown[0]], [grown[1]])
+    near, distant = build_inputs(own, [aside], there, back), build_inputs(far[0], [far[1]], [grown[0]], [grown[1]])
     assert near is not None
     assert distant is not None
     for ours, theirs in zip(complete(near, "cpu"), complete(distant, "cpu"), strict=True):

@@ -96,8 +96,8 @@ def test_both_rounds_of_completion_ask_the_same_views_where_one_is_missing(
         if file.name != stereo._path(missing.id).name:
             shutil.copy(file, tmp_path)
     asked: list[list[np.ndarray]] = []
-    monkeypatch.setattr(stereo_provider, "gather_case", lambda own, lenders, lent, warps: asked.append(warps) or True)
-    monkeypatch.setattr(stereo_provider, "ask_again", lambda case, others, warps: asked.append(warps))
+    monkeypatch.setattr(stereo_provider, "build_inputs", lambda own, lenders, lent, warps: asked.append(warps) or True)
+    monkeypatch.setattr(stereo_provider, "update_view_evidence", lambda case, others, warps: asked.append(warps))
     monkeypatch.setattr(fresh, "_completed", lambda index: index)
     fresh.case(4)
     assert len(asked) == 2

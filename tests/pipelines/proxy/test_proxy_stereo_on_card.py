@@ -16,7 +16,7 @@ pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip
 from test_proxy_stereo import CAMERAS, MATRIX, scene, view_of_plane  # noqa: E402
 
 from msgs_slam.pipelines.compute import gpu  # noqa: E402
-from msgs_slam.pipelines.depth.stereo import card, matching  # noqa: E402
+from msgs_slam.pipelines.depth.stereo import cuda, matching  # noqa: E402
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths  # noqa: E402
 from msgs_slam.pipelines.depth.stereo.sweep import (  # noqa: E402
     refine_inverse_depth,
@@ -48,12 +48,12 @@ def pictures() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def on_card(pictures: tuple[np.ndarray, np.ndarray, np.ndarray]) -> card.Matching:
+def on_card(pictures: tuple[np.ndarray, np.ndarray, np.ndarray]) -> cuda.Matching:
     image, others, warps = pictures
-    return card.Matching(*(torch.from_numpy(np.float32(x)).to(DEVICE) for x in (image, others, warps.reshape(-1, 12))))
+    return cuda.Matching(*(torch.from_numpy(np.float32(x)).to(DEVICE) for x in (image, others, warps.reshape(-1, 12))))
 
 
-def test_the_sweep_has_the_costs_of_the_cpu(pictures: tuple, on_card: card.Matching) -> None:
+def test_the_sweep_has_the_costs_of_the_cpu(pictures: tuple, on_card: cuda.Matching) -> None:
     found = on_card.cost(PLANES).cpu().numpy()
     expected = to_dense(sweep_cost(*pictures, PLANES, matching.best_count(len(pictures[1])), BANDS))
     assert found.shape == expected.shape
@@ -62,7 +62,7 @@ def test_the_sweep_has_the_costs_of_the_cpu(pictures: tuple, on_card: card.Match
     assert (np.abs(found - expected) > 1e-3).mean() < 5e-3
 
 
-def test_paths_are_smoothed_as_on_the_cpu(pictures: tuple, on_card: card.Matching) -> None:
+def test_paths_are_smoothed_as_on_the_cpu(pictures: tuple, on_card: cuda.Matching) -> None:
     cost = np.random.default_rng(1).random((*pictures[0].shape, 19)).astype(np.float32)
     found = on_card.smoothed(torch.from_numpy(cost).to(DEVICE), matching.SMALL_STEP).cpu().numpy()
     dense = of_dense(cost)
@@ -70,11 +70,11 @@ def test_paths_are_smoothed_as_on_the_cpu(pictures: tuple, on_card: card.Matchin
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
-def test_planes_that_are_not_tried_are_left_out_as_on_the_cpu(pictures: tuple, on_card: card.Matching) -> None:
+def test_planes_that_are_not_tried_are_left_out_as_on_the_cpu(pictures: tuple, on_card: cuda.Matching) -> None:
     cost = np.random.default_rng(1).random((*pictures[0].shape, 19)).astype(np.float32)
     tried = np.zeros((1, 2, 19), np.bool_)
     tried[0, 0, [2, 3, 6]], tried[0, 1, 9:14] = True, True
-    left = card.leave_out(torch.from_numpy(cost).to(DEVICE), tried)
+    left = cuda.leave_out(torch.from_numpy(cost).to(DEVICE), tried)
     there = of_dense(np.where(tried.repeat(TILE, 0)[:ROWS].repeat(TILE, 1)[:, :COLUMNS], cost, UNREACHED))
     expected = smooth_cost(there, pictures[0], matching.SMALL_STEP, matching.JUMP, matching.EDGE, BANDS)
     found = on_card.picked(on_card.smoothed(left, matching.SMALL_STEP), PLANES).cpu().numpy()
@@ -84,7 +84,7 @@ def test_planes_that_are_not_tried_are_left_out_as_on_the_cpu(pictures: tuple, o
     assert (to_dense(expected)[:, :16, [2, 3, 6]] < UNREACHED).all()
 
 
-def test_the_refinement_and_the_filter_are_those_of_the_cpu(pictures: tuple, on_card: card.Matching) -> None:
+def test_the_refinement_and_the_filter_are_those_of_the_cpu(pictures: tuple, on_card: cuda.Matching) -> None:
     inverse = (0.45 + 0.05 * np.random.default_rng(2).random(pictures[0].shape)).astype(np.float32)
     there = torch.from_numpy(inverse).to(DEVICE)
     expected = refine_inverse_depth(
@@ -102,7 +102,7 @@ def test_the_refinement_and_the_filter_are_those_of_the_cpu(pictures: tuple, on_
 def test_the_whole_match_finds_the_plane(pictures: tuple, monkeypatch: pytest.MonkeyPatch, large: int) -> None:
     """At two sizes, and at three."""
     monkeypatch.setattr(matching, "LARGE", large)
-    found = card.match_planes(matching.StereoImages(*pictures), PLANES, DEVICE)
+    found = cuda.match_planes(matching.StereoImages(*pictures), PLANES, DEVICE)
     expected = matching.match_planes(matching.StereoImages(*pictures), PLANES, BANDS)
     truth = 1 / view_of_plane(np.eye(4), 0.3)[1][:ROWS, :COLUMNS]
     assert np.median(np.abs(found - truth)) < 0.5 * (PLANES[1] - PLANES[0])
@@ -123,7 +123,7 @@ def test_depths_are_fused_as_on_the_cpu() -> None:
     depth[:4], others[0, 20:25] = 0, 0
     warps = warps_to(MATRIX, np.eye(4), [MATRIX] * 4, cameras)
     back = np.array([warps_to(MATRIX, c, [MATRIX], [np.eye(4)])[0][2] for c in cameras])
-    found = card.fuse_depths(depth, others, warps, back, 0.01, DEVICE)
+    found = cuda.fuse_depths(depth, others, warps, back, 0.01, DEVICE)
     expected = fuse_depths(depth, others, warps, back, 0.01, BANDS)
     for mine, theirs in zip(found, expected, strict=True):
         assert theirs.max() > 0.5
@@ -134,7 +134,7 @@ def test_a_keyframe_asks_for_few_launches(pictures: tuple, monkeypatch: pytest.M
     launched, right = [], gpu.launch
     monkeypatch.setattr(gpu, "launch", lambda kernel, *a, **k: launched.append(kernel) or right(kernel, *a, **k))
     small = matching.StereoImages(pictures[0][:6, :8].copy(), pictures[1][:, :6, :8].copy(), pictures[2])
-    card.match_planes(small, PLANES[:4], DEVICE)
+    cuda.match_planes(small, PLANES[:4], DEVICE)
     assert len(launched) == (8 + 2) + (8 + 5)
 
 
@@ -146,6 +146,6 @@ def test_the_kernels_compile_for_cards(tmp_path: Path) -> None:
     numbers = ("views", "count", "width", "height", "down", "across", "pixels")
     floats = ("narrow", "step", "stiffness", "small", "large", "edge", "nearest", "by_value", "by_place")
     kinds = dict.fromkeys(numbers, "i32") | dict.fromkeys(floats, "fp32") | {"starts": "*i32"}
-    build({"depth.stereo.card_kernels": names[:-1]}, constants, kinds, tmp_path)
+    build({"depth.stereo.cuda_kernels": names[:-1]}, constants, kinds, tmp_path)
     double = {"warps": "*fp64", "backs": "*fp64"}
-    build({"depth.stereo.card_kernels": names[-1:]}, constants, kinds | double, tmp_path)
+    build({"depth.stereo.cuda_kernels": names[-1:]}, constants, kinds | double, tmp_path)

@@ -1,4 +1,4 @@
-"""Stereo on a card: `match_planes` and `fuse_depths` by kernels of Triton. Arrays come from the host and go back; what
+"""Stereo on a GPU: `match_planes` and `fuse_depths` by kernels of Triton. Arrays come from the host and go back; what
 lies between stays there."""
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _BLOCK = 64
 
 
 def takes_kernels_on(device: str) -> bool:
-    """Whether there is a card that runs them."""
+    """Whether there is a GPU that runs them."""
     return gpu.supports_triton(torch.empty(0, device=device))
 
 
@@ -51,7 +51,7 @@ def _planes_near(
 
 
 def leave_out(cost: Tensor, tried: NDArray[np.bool_]) -> Tensor:
-    """(H, W, D) cost as the CPU has it where planes are not `tried`. All are compared: a card gains nothing else."""
+    """(H, W, D) cost as the CPU has it where planes are not `tried`. All are compared: a GPU gains nothing else."""
     height, width, _ = cost.shape
     there = torch.from_numpy(tried).to(cost.device)
     there = there.repeat_interleave(TILE, 0)[:height].repeat_interleave(TILE, 1)[:, :width]
@@ -67,7 +67,7 @@ def fuse_depths(
     device: str,
 ) -> tuple[Array, Array, Array]:
     """Return what `consistency.fuse_depths` does."""
-    from .card_kernels import fuse_pixels  # imports triton
+    from .cuda_kernels import fuse_pixels  # imports triton
 
     pictures = (_there(depth, device), _there(others, device))
     places = (torch.from_numpy(np.ascontiguousarray(x)).to(device) for x in (warps.reshape(-1, 12), back_rows))
@@ -79,7 +79,7 @@ def fuse_depths(
 
 
 class Matching:
-    """The steps of the match: a picture (H, W), others (N, H, W) and their warps (N, 12), float32 on a card."""
+    """The steps of the match: a picture (H, W), others (N, H, W) and their warps (N, 12), float32 on a GPU."""
 
     def __init__(self, image: Tensor, others: Tensor, warps: Tensor) -> None:
         self._image, self._given = image, (image, others, warps)
@@ -96,7 +96,7 @@ class Matching:
 
     def picked(self, total: Tensor, planes: NDArray[np.float64]) -> Tensor:
         """(H, W) inverse depth of least total cost (H, W, D)."""
-        from .card_kernels import pick_pixels
+        from .cuda_kernels import pick_pixels
 
         inverse = torch.empty_like(self._image)
         numbers = (inverse.numel(), len(planes), float(planes[0]), float(planes[1] - planes[0]))
@@ -106,7 +106,7 @@ class Matching:
 
     def cost(self, planes: NDArray[np.float64]) -> Tensor:
         """(H, W, D) as of `sweep_cost`."""
-        from .card_kernels import sweep_pixels
+        from .cuda_kernels import sweep_pixels
 
         cost = self._image.new_empty(*self._image.shape, len(planes))
         numbers = (len(self._given[1]), len(planes), *self._size, -0.5 / LIKENESS**2)
@@ -117,7 +117,7 @@ class Matching:
     def smoothed(self, cost: Tensor, small: float) -> Tensor:
         """(H, W, D) as of `smooth_cost`, `small` the price of a step of one plane; a launch for each direction, a
         program for each path."""
-        from .card_kernels import scan_paths
+        from .cuda_kernels import scan_paths
 
         total, count = torch.zeros_like(cost), cost.shape[2]
         numbers = (count, small, rules.JUMP, rules.EDGE)
@@ -129,7 +129,7 @@ class Matching:
 
     def soften(self, values: Tensor, spread: float) -> Tensor:
         """(H, W) after the bilateral filter, `spread` the sd of its values."""
-        from .card_kernels import soften_pixels
+        from .cuda_kernels import soften_pixels
 
         out, numbers = torch.empty_like(values), (-0.5 / spread**2, -0.5 / rules.SOFT_PLACE**2)
         _run(soften_pixels, out.numel(), values, out, *self._size, *numbers, REACH=rules.SOFT_SIZE // 2)
@@ -137,7 +137,7 @@ class Matching:
 
     def refined(self, inverse: Tensor, step: float) -> Tensor:
         """(H, W) as of `refine_inverse_depth`."""
-        from .card_kernels import refine_pixels
+        from .cuda_kernels import refine_pixels
 
         refined = torch.empty_like(inverse)
         numbers = (len(self._given[1]), *self._size, -0.5 / ALIKE**2, float(step), rules.STIFFNESS)

@@ -1,4 +1,4 @@
-"""Triton kernels of stereo: the loops of `sweep`, `smoothing`, `refine` and `consistency` for a card.
+"""Triton kernels of stereo: the loops of `sweep`, `volume`, `refine` and `consistency` for a GPU.
 
 Pictures and volumes are flat, row by row; (BLOCK, TAPS) is a block of pixels by the pixels of their windows. The
 interpreter of Triton (environment variable TRITON_INTERPRET=1) runs these kernels on CPU tensors.
