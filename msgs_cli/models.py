@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from ..pipelines.system.wording import BAD
-from .doctor import print_findings
-from .output import format_table, say, terminal_width
+from .output import format_table, terminal_width
 
 if TYPE_CHECKING:
     from ..pipelines.networks.registry import Model, ModelStore
@@ -18,7 +15,7 @@ if TYPE_CHECKING:
 
 @click.group()
 def models() -> None:
-    """List, download and check the learned models for depth and classes. A reconstruction never downloads."""
+    """List and download the learned models for depth and classes. A reconstruction never downloads."""
 
 
 _WIDTH = 100
@@ -141,36 +138,6 @@ def verify() -> None:
         click.echo(f"{name:18} {state}")
     if any(state.startswith("damaged") for state in found.values()):
         raise SystemExit(1)
-
-
-@models.command()
-@click.argument("names", nargs=-1, metavar="[NAME|CARD]...")
-def check(names: tuple[str, ...]) -> None:
-    """Run the installed networks, or those named or described by a CARD.toml, on a built-in image of known depth.
-
-    Compares input, outputs, sizes, units and ranges of values with what the card says; exit code 1 where it is wrong.
-    """
-    from ..formats.errors import InputError
-    from ..pipelines.networks.card import read_card
-    from ..pipelines.networks.registry import ModelStore
-
-    store = ModelStore.open()
-    own = {name: read_card(Path(name)) for name in names if Path(name).suffix.lower() in (".toml", ".json")}
-    chosen = [store.get(name) for name in names if name not in own]
-    with_card = [m for m in chosen or ([] if own else store.models) if "input" in store.families[m.family]]
-    cards = own | {m.name: store.card(m) for m in with_card if chosen or store.is_here(m)}
-    if not cards:
-        raise InputError(f"no network with a card is in {store.cache}; run: msgs-slam models pull")
-    from ..pipelines.evaluation.demo import known_view
-    from ..pipelines.networks.check import check_network
-
-    view = known_view()
-    found = {name: check_network(card, view) for name, card in cards.items()}
-    for name, findings in found.items():
-        say(f"{name}: {cards[name].model}")
-        print_findings(findings)
-    if any(f.state == BAD for findings in found.values() for f in findings):
-        sys.exit(1)
 
 
 @models.command()

@@ -1,6 +1,5 @@
 """The demo: a short synthetic video, reconstructed like any other video, evaluated against its ground truth."""
 
-import tempfile
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,18 +11,13 @@ from ...formats.datasets import open_sequence
 from ...formats.errors import InputError
 from ...formats.images import write_rgb
 from ...formats.video import VideoReader
-from ..networks.check import KnownView
 from ..run.folder import RunFolder
 from ..system.progress import Progress
-from ..types import Intrinsics
 from .write import write_evaluation
 
 VIDEO, TRUTH, RUN = "room.mp4", "room_truth", "room.msgs"
 CLIP = Path(__file__).with_name("demo_clip")
 """The video, and its truth without the images as a zip: 36 frames of a made-up room (tests/world/demo_clip.py)."""
-
-_KNOWN_FRAME = 18
-"""Walls, floor, table and shelf, from one to four metres away."""
 
 
 @dataclass(frozen=True)
@@ -50,18 +44,6 @@ def unpack_demo_clip(folder: Path, clip: Path = CLIP) -> tuple[Path, Path]:
         archive.extractall(truth)
     write_bytes(video, content)  # last: where it is, the truth is whole
     return video, truth
-
-
-def known_view(clip: Path = CLIP) -> KnownView:
-    """A frame of the clip, with what is known of it."""
-    with tempfile.TemporaryDirectory() as folder:
-        sequence = open_sequence(unpack_demo_clip(Path(folder), clip)[1])
-        camera, depth, labels = sequence.camera, sequence.depth(_KNOWN_FRAME), sequence.labels(_KNOWN_FRAME)
-        assert camera is not None
-        assert depth is not None
-        assert labels is not None
-        intrinsics = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        return KnownView(sequence.rgb(_KNOWN_FRAME), depth, intrinsics, labels, sequence.class_names)
 
 
 def run_demo(

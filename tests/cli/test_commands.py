@@ -328,7 +328,7 @@ def test_what_computes_nothing_loads_nothing_that_computes(finished_run: Finishe
         ("batch", no_run / "nowhere", "--out", no_run), ("reconstruct", none), ("reconstruct", torn),
         ("reconstruct", no_run), ("reconstruct", finished_run.video, "--semantics", "tags", "--out", no_run / "a"),
         ("reconstruct", finished_run.video, "--set", "frames.rate=-1"), ("demo", "--set", "frames.rate=-1"),
-        ("models", "check", "nothing"),
+        ("models", "path", "nothing"),
     )  # fmt: skip
     lines = ["\t".join(map(str, words)) for words in (*fine, *refused)]
     done = subprocess.run(

@@ -1,23 +1,32 @@
-"""Networks against their cards, on an image whose depth and classes are known.
+"""Networks against their cards, on a frame of the demo whose depth and classes are known.
+
+    python tests/benchmarks/network_check.py [NAME|CARD.toml] ...     without a name: all in the cache
 
 Files of one network go round with and without normalisation in the graph, in metres and in canonical depth: what
-opens, and answers with numbers, may still be read wrongly. Here it is seen by its errors.
+opens, and answers with numbers, may still be read wrongly. Here it is seen by its errors. Exit code 1 where it is.
 """
 
 import copy
+import sys
+import tempfile
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.errors import InputError
-from ..geometry.voxels import normals_in_cam
-from ..system.wording import BAD, GOOD, NOTE, Finding
-from ..types import Intrinsics
-from .card import Card
-from .outputs import network_depth, network_probabilities
-from .runtime import is_tflite
-from .session import Letterbox, Network
+from msgs_slam.formats.datasets import open_sequence
+from msgs_slam.formats.errors import InputError
+from msgs_slam.msgs_cli.doctor import print_findings
+from msgs_slam.pipelines.evaluation.demo import unpack_demo_clip
+from msgs_slam.pipelines.geometry.voxels import normals_in_cam
+from msgs_slam.pipelines.networks.card import Card, read_card
+from msgs_slam.pipelines.networks.outputs import network_depth, network_probabilities
+from msgs_slam.pipelines.networks.registry import ModelStore
+from msgs_slam.pipelines.networks.runtime import is_tflite
+from msgs_slam.pipelines.networks.session import Letterbox, Network
+from msgs_slam.pipelines.system.wording import BAD, GOOD, NOTE, Finding
+from msgs_slam.pipelines.types import Intrinsics
 
 _PLAIN, _IMAGENET, _HALVES = ((0.0,) * 3, (1.0,) * 3), ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)), ((0.5,) * 3,) * 2
 _RANGES = {
@@ -35,6 +44,8 @@ _LOG_OFF = np.log(1.3)
 _LENGTH_TOLERANCE = 0.05
 _TOKENS_BEFORE = {0: "no class token", 1: "a class token", 5: "a class token and 4 registers"}
 _PATCHES = (8, 14, 16, 28, 32)
+_KNOWN_FRAME = 18
+"""Walls, floor, table and shelf, from one to four metres away."""
 
 
 @dataclass(frozen=True)
@@ -279,3 +290,33 @@ def _person(network: Network, view: KnownView) -> list[Finding]:
     share = float((output > 0.5).mean())
     state = GOOD if share < 0.1 else NOTE
     return [Finding("values", state, f"{share:.1%} of an image without people is taken for one")]
+
+
+def known_view() -> KnownView:
+    """Read a frame of the demo, with what is known of it."""
+    with tempfile.TemporaryDirectory() as folder:
+        sequence = open_sequence(unpack_demo_clip(Path(folder))[1])
+        camera, depth, labels = sequence.camera, sequence.depth(_KNOWN_FRAME), sequence.labels(_KNOWN_FRAME)
+        assert camera is not None
+        assert depth is not None
+        assert labels is not None
+        intrinsics = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        return KnownView(sequence.rgb(_KNOWN_FRAME), depth, intrinsics, labels, sequence.class_names)
+
+
+def main(names: list[str]) -> None:
+    """Check the named networks, or all that are installed."""
+    store, view, bad = ModelStore.open(), known_view(), False
+    installed = [m for m in store.models if "input" in store.families[m.family] and store.is_here(m)]
+    is_file = {name: Path(name).suffix.lower() in (".toml", ".json") for name in names}
+    cards = {n: read_card(Path(n)) if is_file[n] else store.card(store.get(n)) for n in names}
+    for name, card in (cards or {m.name: store.card(m) for m in installed}).items():
+        found = check_network(card, view)
+        print(f"{name}: {card.model}")
+        print_findings(found)
+        bad |= any(f.state == BAD for f in found)
+    sys.exit(bad)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
