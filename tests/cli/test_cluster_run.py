@@ -29,6 +29,7 @@ def test_two_nodes_of_which_one_is_lost_leave_what_one_process_does(
 
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))  # as an installed program is found
     monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "0")
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # with its 15 anything else starves the tasks
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
     lost = cluster.add_node(num_cpus=1)
     killed: list[str] = []
