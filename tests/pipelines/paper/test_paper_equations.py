@@ -275,8 +275,8 @@ def test_16_tracking_loss_by_hand() -> None:
 def test_16_finds_a_pose_again() -> None:
     view = a_view(camera=CAMERA.resized(160, 120))
     gaussians, identity = a_map(view), torch.eye(4, dtype=torch.float64)
-    losses = [mapping.optimise(gaussians, view, identity, 2, 2.0) for _ in range(20)]  # seeds are not opaque yet
-    assert losses[-1] < losses[0]
+    for _ in range(20):  # seeds are not opaque yet
+        mapping.optimise(gaussians, view, identity, 2, 2.0)
     start = se3.exp(torch.tensor([0.03, -0.02, 0.02, 0.01, -0.01, 0.01], dtype=torch.float64))
 
     def pixels_off(pose: Tensor) -> float:
@@ -399,6 +399,15 @@ def test_gradients_are_clipped_beside_boundaries_alone() -> None:
     assert image.grad is not None
     assert image.grad[2, 0, 0] == 100
     assert 1 < image.grad[2, 3, 0] < 20
+
+
+def test_mapping_lowers_its_loss() -> None:
+    view, pose = a_view(), torch.eye(4, dtype=torch.float64)
+    gaussians = a_map(view)
+    losses = [mapping.optimise(gaussians, view, pose, 2, 2.0) for _ in range(12)]
+    assert losses[-1] < losses[0]
+    mapping.prune(gaussians, 2.0)
+    assert 0 < len(gaussians) <= 36 * 48
 
 
 # (21) to (26) ---------------------------------------------------------------------------------------------------
