@@ -25,12 +25,13 @@ from .state import OptimiserState
 from .views import View
 
 SEED_OPACITY = 0.73
+"""Opacity (0..1) of a seed of an empty map."""
 SEED_RADIUS = 0.7
 """Radius of a seed in units of the distance between seeds on the image: neighbours then overlap without blurring."""
 SEED_LOGIT = 3.0
 """Logit of a seed's own class against 0 for the others."""
 MIN_DETAIL = 8.0
-"""Colours that differ by less, of 255, are no detail however little else there is."""
+"""Range of colours (of 255) in 3 x 3 pixels below which there is no detail."""
 
 
 @dataclass(frozen=True)
@@ -173,32 +174,34 @@ def seed_grid(height: int, width: int, stride: int) -> NDArray[np.bool_]:
 
 
 CHILDREN = 4
+"""Gaussians in the place of one that is split."""
 CHILD_RADIUS, CHILD_OFFSET = 0.55, 0.6
-"""In radii of the parent: the children cover together what it covered, and a little less reaches over its rim."""
+"""Radius of a child and distance from the parent's centre along both tangents, in radii of the parent: the children
+cover together what it covered, and a little less reaches over its rim."""
 _NEIGHBOURS = 12
 """Gaussians around a parent, itself included, to which the plane of its surface is fitted."""
 
 GROWN_OPACITY = 0.3
-"""Of Gaussians added to a map that is already there: opaque ones would hide what has been learnt."""
-LOW_RELIABILITY = 0.35
-HIGH_RELIABILITY = 0.85
+"""Opacity (0..1) of Gaussians added to a map that is there: opaque ones would hide what has been learnt."""
+LOW_RELIABILITY, HIGH_RELIABILITY = 0.35, 0.85
+"""Reliability U (0..1) of a depth: up to the first it is low, above the second high (τ of MSGS-SLAM 3.1)."""
 FINE_SHARE, FLAT_SHARE = 0.25, 0.5
 """Shares of a view: that of most detail gets a new Gaussian at every pixel, that of least detail twice as far apart."""
 HOLE = 0.55
-"""T_sil: less coverage than this is a hole."""
+"""T_sil, a silhouette (0..1): a pixel of less is a hole."""
 DEPTH_TOLERANCE = 0.05
-"""T_depth, relative: a proxy nearer than the map by more adds Gaussians."""
+"""T_depth, relative to the proxy's depth: where that is nearer than the map by more, Gaussians are added."""
 SPLIT_RADIUS = 1.0
-"""Pixels: in a view where a Gaussian is smaller it answers for nothing."""
+"""Radius on the image, in pixels: a Gaussian that is smaller in a view has no share of that view's errors."""
 SPLIT_ERROR = 0.1
-"""Colour error 0..1, summed over a view's pixels: Gaussians that answer for more are split."""
+"""Share of the colour errors (0..1) of a view's pixels, summed: Gaussians of more are split."""
 PRUNE_OPACITY, PRUNE_WEIGHT, PRUNE_RADIUS = 0.03, 0.05, 0.15
 """Gaussians go that are more transparent than this, of less blending weight in every pixel of every visit of a pass (a
 fifth fewer at +0.06 dB), or larger than this in units of the scene's median depth."""
 SPACINGS_ROOM = 50e6
 """Bytes of seed distances that are kept."""
 _SOLID = 0.8
-"""Silhouette above which the map knows the depth of a pixel."""
+"""Silhouette (0..1) above which the map knows the depth of a pixel."""
 
 
 @dataclass(frozen=True)

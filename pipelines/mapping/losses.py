@@ -225,11 +225,11 @@ def _gradient_at(planes: NDArray[np.float32], blurred: NDArray[np.float32], i: i
 # exposure -------------------------------------------------------------------------------------------------------
 
 STRIDE = 4
-"""Stride of the pixels that are used, in both directions."""
+"""Pixels from one that the exposure is fitted to to the next, in both directions."""
 SOLID = 0.9
-"""Of what the map covers less, its colours say nothing yet."""
+"""Silhouette (0..1) up to which the colours of the map say nothing yet."""
 MIN_PIXELS = 100
-"""Pixels without which the exposure stays as it was."""
+"""Pixels (of those fitted to) below which the exposure stays as it was."""
 OUTLIER = 0.02
 """Difference of colours (0..1) from which a pixel counts the less the larger it is: light and shade on what is wrong in
 the map are not the camera's."""
@@ -240,6 +240,7 @@ less contrast than its photo, so that gains fall from keyframe to keyframe; a pu
 then grows, would lose hold of it (on a walk of 20 minutes gains fell to the limit, and the map by 15 dB). On a surface
 of one colour gain and offset say the same."""
 MAX_GAIN = 5.0
+"""Factor between colours of the map and of the photo, at most, and its inverse at least."""
 
 
 @torch.no_grad()

@@ -20,7 +20,7 @@ _BLOCK = 512
 """Numbers a program of the kernels."""
 
 SILHOUETTE_WEIGHT = 0.05
-"""Of the pressure towards an opaque map."""
+"""Weight (of mean transparency, 0..1) of the pressure towards an opaque map."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ MAP_RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 
 HALVES_ROOM = 250e6
 """Bytes of views at half the size that are kept; to halve one takes a hundredth of a visit."""
 POSE_RATE = 1e-4
-"""Of rotations (radians) and translations (times the median depth)."""
+"""Learning rate of a view's twist: of rotations in radians, of translations in median depths of the scene."""
 LOW_TRUST_STEP = 4.0
 """Steps of Gaussians of unreliable depth are so many times as large, of medium ones by its root."""
 

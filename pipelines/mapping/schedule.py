@@ -15,7 +15,7 @@ from ..geometry.posed_depth import overlaps
 from .views import View
 
 WINDOW_STEPS = 2
-"""Coarse steps after each keyframe while the map is seeded: on it, covisible and random past keyframes."""
+"""Steps (at half the size) for each keyframe while the map is seeded: on it, covisible and random past ones."""
 COARSE_SHARE = 0.25
 """Share of the visits at half the size, before the others."""
 DENSIFY_EVERY, DENSIFY_UNTIL = 2, 0.45
