@@ -26,7 +26,7 @@ from typing import IO, TYPE_CHECKING, Any, Generic, TypeVar
 
 from ...formats.atomic import process_token
 from ...formats.errors import InputError
-from ...formats.reading import file_sha256, known_sha256, noting_files, on_each_read
+from ...formats.reading import known_sha256, noting_files, on_each_read
 from ..config import EXTENSION, Config
 from ..system.identity import ROOMS, ROOT
 from ..system.progress import Progress
@@ -99,7 +99,7 @@ def _digest_of_path(path: Path) -> str:
     with noting_files(), suppress(InputError, OSError, ValueError):
         if path.is_dir():
             return hashlib.sha256("\0".join(sorted(os.listdir(path))).encode("utf-8", "surrogateescape")).hexdigest()
-        return known_sha256(path) if path.stat().st_size > 0 else file_sha256(path)
+        return known_sha256(path)
     return ""
 
 

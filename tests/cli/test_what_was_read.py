@@ -5,6 +5,7 @@ is found here. Of the package's own files `tests/pipelines/system/test_identity.
 """
 
 import os
+import re
 import shutil
 import sys
 from collections import defaultdict
@@ -19,10 +20,12 @@ from cli_runs import QUICK, FinishedRun, invoke
 from msgs_slam.formats.images import write_grey_png
 from msgs_slam.pipelines.config import STAGES, Config
 from msgs_slam.pipelines.reconstruct import all_stages
+from msgs_slam.pipelines.run import files as run_files
 from msgs_slam.pipelines.run import runner
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings, load_source
 from msgs_slam.pipelines.run.manifest import StageRecord
 from msgs_slam.pipelines.run.reads import Situation
+from msgs_slam.pipelines.run.schema import RunFile
 from msgs_slam.pipelines.source.recording import open_recording
 from tests.networks import PICTURE, save_network
 
@@ -79,7 +82,7 @@ def world(finished_run: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -
     (given / "net").mkdir()
     save_network(given / "net" / "net.onnx", PICTURE, "float[1, 3, H, W] y", "y = Mul (x, gain)", gain=[2.0])
     (given / "net" / "card.toml").write_text(LABELS)
-    settings = [x for s in (*QUICK, "proxy.fuse=never", "export.texture=off") for x in ("--set", s)]
+    settings = [x for s in (*QUICK, "proxy.fuse=never", "frames.parallax=0.2") for x in ("--set", s)]
     options = ("--poses", given / "poses.txt", "--intrinsics", given / "camera.txt", "--masks", given / "masks")
     proxies = ("--depth", f"files:{given / 'depth'}", "--semantics", f"onnx:{given / 'net' / 'card.toml'}")
     run_one = runner._run_one
@@ -119,7 +122,8 @@ def flip(path: Path) -> bytes:
 def test_any_byte_of_what_was_given_changes_the_stages_that_have_opened_it_and_no_other(world: World) -> None:
     assert world.changed() == set()
     expected = {
-        "room.avi": set(STAGES), "poses.txt": {"frames"}, "camera.txt": {"frames"}, "masks/000003.png": {"frames"},
+        "room.avi": set(STAGES), "poses.txt": {"frames"}, "camera.txt": {"frames", "global_ba"},
+        "masks/000003.png": {"frames"},
         "net/net.onnx": {"proxy"}, "net/card.toml": {"proxy"}, "track.csv": {"export"}, "depth/notes.txt": set(),
         **{f"depth/{n:06d}.png": {"proxy"} for n in range(14)},
     }  # fmt: skip
@@ -127,8 +131,10 @@ def test_any_byte_of_what_was_given_changes_the_stages_that_have_opened_it_and_n
     assert {p.relative_to(world.given).as_posix() for p in files} == set(expected)
     for path in files:
         name, before = path.relative_to(world.given).as_posix(), flip(path)
-        assert world.changed() == expected[name], name
-        path.write_bytes(before)
+        try:
+            assert world.changed() == expected[name], name
+        finally:
+            path.write_bytes(before)
         seen = {stage for stage in STAGES if path in world.opened[stage]}
         assert seen <= expected[name], "what was heard is noted"
     assert world.changed() == set()
@@ -170,5 +176,27 @@ def test_settings_that_were_not_asked_for_change_nothing(world: World) -> None:
             for stage in changed:
                 counts[stage] += 1
     assert min(counts.values()) > 3
-    unread = {"frames.loop_candidates", "proxy.stereo_planes"}  # poses are given, and depth
+    unread = {"proxy.stereo_planes", "proxy.stereo_side", "run.kappa"}  # depth is given
     assert not unread & {name for record in world.records.values() for name in record.reads.settings}
+
+
+def table_of_files(*runs: dict[str, StageRecord]) -> str:
+    """The rows of `run/files.py` as `docs/files.md` shows them: which stage leaves a file, and which ones read it."""
+    kinds = [*(kind for kind in vars(run_files).values() if isinstance(kind, RunFile)), *run_files.FIGURES.values()]
+    lines = ["| file (N: a frame) | left by → read by |", "| --- | --- |"]
+    for kind in {kind.name: kind for kind in kinds}.values():
+        pattern = re.compile("(.*/)?" + re.escape(kind.name).replace(r"\{:06d\}", r"\d+").replace(r"\{\}", ".+"))
+        ways = []
+        for stage in kind.stages:
+            names = {
+                s: [n for records in runs for n in records[s].reads.results.get(stage, ("", []))[1]] for s in STAGES
+            }
+            readers = [later for later in STAGES if any(map(pattern.fullmatch, names[later]))]
+            ways.append(f"{stage} → {', '.join(readers)}" if readers else stage)
+        lines.append(f"| `{kind.name.replace('{:06d}', 'N').replace('{}', 'N')}` | {'; '.join(ways)} |")
+    return "\n".join(lines)
+
+
+def test_the_page_of_files_shows_who_leaves_and_who_reads_each(world: World, finished_run: FinishedRun) -> None:
+    runs = load_records(RunFolder(finished_run.folder)), world.records
+    assert table_of_files(*runs) in (Path(__file__).parents[2] / "docs" / "files.md").read_text()
