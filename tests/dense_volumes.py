@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.depth.stereo.volume import BLOCK, TILE, UNREACHED, Volume, tiles_of
+from msgs_slam.pipelines.depth.stereo.volume import BLOCK, TILE, UNREACHED, CostVolume, tiles_of
 
 
-def to_dense(volume: Volume) -> NDArray[np.float32]:
+def to_dense(volume: CostVolume) -> NDArray[np.float32]:
     """(H, W, D), UNREACHED where no plane is tried."""
     there, cells = _cells(volume)
     blocks = np.where(there, volume.values[np.where(there, cells, 0)], UNREACHED)
@@ -15,10 +15,10 @@ def to_dense(volume: Volume) -> NDArray[np.float32]:
     return np.minimum(whole[: volume.height, : volume.width, : volume.planes], UNREACHED)
 
 
-def of_dense(cost: NDArray[np.float32]) -> Volume:
-    """Volume of all of (H, W, D)."""
+def of_dense(cost: NDArray[np.float32]) -> CostVolume:
+    """CostVolume of all of (H, W, D)."""
     height, width, planes = cost.shape
-    volume = Volume.of_tried(height, width, np.ones((*tiles_of(height, width), planes), np.bool_))
+    volume = CostVolume.of_tried(height, width, np.ones((*tiles_of(height, width), planes), np.bool_))
     down, across, count = volume.places.shape
     whole = np.full((down * TILE, across * TILE, count * BLOCK), UNREACHED)
     whole[:height, :width, :planes] = cost
@@ -27,7 +27,7 @@ def of_dense(cost: NDArray[np.float32]) -> Volume:
     return volume
 
 
-def _cells(volume: Volume) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+def _cells(volume: CostVolume) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Whether each block is there, and where its numbers are: (tiles down, across, blocks, TILE, TILE, BLOCK)."""
     pixels = np.arange(TILE * TILE).reshape(TILE, TILE, 1) * volume.strides[:, :, None, None, None, None]
     first = volume.places[..., None, None, None]

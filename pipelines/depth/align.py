@@ -21,7 +21,7 @@ from ..providers import DepthEstimate
 from ..system.machine import ALIGNED_TOGETHER
 from ..system.parallel import LruSequence
 from ..types import Intrinsics, ProxyMaps
-from .fields import FINE, Basis, DepthFields, Equations, Grid, Prior, solve_fields
+from .fields import FINE, Basis, DepthFields, Equations, FieldGrid, Prior, solve_fields
 
 Array = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ GROSS = 0.15
 ROUNDS = 4
 _ROOM = 60_000_000
 """Bytes of depths, and of samples of them, that are kept; what has no room is read again."""
-COARSE = Grid(3, 4)
+COARSE = FieldGrid(3, 4)
 """Of the fields that points alone can determine."""
 POINTS_PRIOR = Prior(COARSE, node_sd=0.06, step_sd=0.05)
 """Around the keyframe's scale."""
@@ -173,7 +173,7 @@ def align_keyframes(
         maps = load_maps(frame_id)
         if maps is not None and (maps.depth > 0).any():
             camera = posed_small(maps, intrinsics, model.cam_from_world[k]).intrinsics
-            anchors[len(rows)] = seen_points(model, k, intrinsics, camera)
+            anchors[len(rows)] = keyframe_anchors(model, k, intrinsics, camera)
             rows.append(k)
     ids = [int(model.frame_ids[k]) for k in rows]
     views = kept_views(len(rows), lambda n: view_of(rows[n]))
@@ -191,13 +191,13 @@ def kept_views(count: int, make: Callable[[int], PosedDepth]) -> Sequence[PosedD
 def posed_small(maps: ProxyMaps | DepthEstimate, intrinsics: Intrinsics, cam_from_world: Array) -> PosedDepth:
     """Depths at the size that is compared."""
     stride = max(round(max(maps.depth.shape) / SIDE), 1)
-    picked = (slice(stride // 2, None, stride),) * 2
-    depth, trust = maps.depth[picked].copy(), maps.confidence[picked].copy()
+    strided = (slice(stride // 2, None, stride),) * 2
+    depth, trust = maps.depth[strided].copy(), maps.confidence[strided].copy()
     height, width = maps.depth.shape
     return PosedDepth(intrinsics.resized(width, height).every(stride), cam_from_world, depth, trust * (depth > 0))
 
 
-def seen_points(model: SparseModel, k: int, full: Intrinsics, small: Intrinsics) -> Anchors:
+def keyframe_anchors(model: SparseModel, k: int, full: Intrinsics, small: Intrinsics) -> Anchors:
     """The model's points in the pixels of the k-th keyframe that sees them."""
     mine = model.observations_of(k)
     points = model.points_in_world[model.obs_point[mine]]
@@ -248,7 +248,7 @@ class _Samples:
         return sum(a.nbytes for a in (self.depth, self.trust, self.rays, self.basis.nodes, self.basis.weights))
 
     @staticmethod
-    def of(view: PosedDepth, grid: Grid) -> _Samples:
+    def of(view: PosedDepth, grid: FieldGrid) -> _Samples:
         xy, depth, trust = view.grid(SAMPLES_ACROSS)
         use = trust > 0.1
         center: Array = np.asarray(np.linalg.inv(view.cam_from_world)[:3, 3], np.float64)

@@ -44,7 +44,7 @@ class Basis:
 
 
 @dataclass(frozen=True)
-class Grid:
+class FieldGrid:
     """rows x columns nodes that span an image from corner to corner; between them the log scale is bilinear.
 
     The columns lie along the longer side of the image, so that nodes are as far apart in an upright image.
@@ -71,18 +71,18 @@ class Grid:
         weights = np.stack([(1 - wx) * (1 - wy), wx * (1 - wy), (1 - wx) * wy, wx * wy], 1)
         return Basis(nodes, weights)
 
-    def finer(self, field: Array, grid: Grid) -> Array:
+    def finer(self, field: Array, grid: FieldGrid) -> Array:
         """(nodes of `grid`,) a field of this grid's (nodes,) at the nodes of another one."""
         x, y = np.meshgrid(np.arange(grid.columns) / (grid.columns - 1), np.arange(grid.rows) / (grid.rows - 1))
         return self.at(np.stack([x.ravel(), y.ravel()], 1), 1, 1).of(field)
 
 
-FINE = Grid(9, 12)
+FINE = FieldGrid(9, 12)
 """Of the fields that are kept."""
 
 
 def field_scales(nodes: Array, height: int, width: int) -> NDArray[np.float32]:
-    """(H, W) the scale of every pixel by log scales at (rows, columns) nodes of a `Grid`."""
+    """(H, W) the scale of every pixel by log scales at (rows, columns) nodes of a `FieldGrid`."""
     if height > width:
         return np.ascontiguousarray(field_scales(nodes, width, height).T)
     rows, columns = nodes.shape
@@ -118,7 +118,7 @@ class DepthFields:
 class Prior:
     """Relative standard deviation of a node from its expected value (node_sd) and from its neighbours (step_sd)."""
 
-    grid: Grid
+    grid: FieldGrid
     node_sd: float
     step_sd: float
 
@@ -188,8 +188,7 @@ def solve_fields(parts: Iterable[Equations], fields: Array, expected: Array, pri
 
 
 def _designs(parts: Iterable[Equations], size: int) -> Iterator[tuple[sparse.csr_matrix, Array]]:
-    """The weighted equations as matrices (Q, size) of some hundred thousand rows, and their residuals (Q,): all of a
-    long recording would take gigabytes."""
+    """The weighted equations as matrices (Q, size) of some hundred thousand rows, and their residuals (Q,)."""
     waiting: list[Equations] = []
     for part in chain(parts, (None,)):
         if part is not None:

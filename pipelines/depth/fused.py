@@ -13,12 +13,12 @@ from ..geometry.camera import project, resize_depth
 from ..providers import DepthEstimate, DepthProvider, Sequence
 from ..system.parallel import LruCache
 from ..types import Frame
-from .align import SAMPLES_ACROSS, Anchors, FieldModel, fit_fields, kept_views, posed_small, seen_points
+from .align import SAMPLES_ACROSS, Anchors, FieldModel, fit_fields, kept_views, keyframe_anchors, posed_small
 from .completion.fill import SURE
-from .fields import DepthFields, Grid, Prior
+from .fields import DepthFields, FieldGrid, Prior
 from .stereo.provider import MultiviewDepth
 
-_OF_NETWORK = FieldModel(Prior(Grid(13, 17), node_sd=0.06, step_sd=0.05), pair_sd=0.02, share=1.0)
+_OF_NETWORK = FieldModel(Prior(FieldGrid(13, 17), node_sd=0.06, step_sd=0.05), pair_sd=0.02, share=1.0)
 """Each sample counts whole: the error of a network is smooth, and the solver is told how smooth."""
 _BLUR, _STEP = 1 / 150, 1.1
 """Half of the width over which a network blurs a step of depth, as a part of the longer side; how large a step is."""
@@ -77,7 +77,7 @@ class FusedDepth(DepthProvider):
         anchors = {}
         for n, frame in enumerate(known):
             assert model is not None, "the stereo has one"
-            points = seen_points(model, rows[frame.id], self._sequence.calibration.intrinsics, views[n].intrinsics)
+            points = keyframe_anchors(model, rows[frame.id], self._sequence.calibration.intrinsics, views[n].intrinsics)
             anchors[n] = points.and_also(self._sure_depths(frame, views[n].intrinsics.width))
         grid = _OF_NETWORK.prior.grid
         fields = fit_fields(views, anchors, how=_OF_NETWORK).reshape(-1, grid.rows, grid.columns)
@@ -113,7 +113,7 @@ class FusedDepth(DepthProvider):
             own, agreed = self._small(frame), self._stereo.agreed(frame, self._small)
             change = np.divide(agreed, own, out=np.ones_like(own), where=own > 0)
             bent *= cv2.resize(change, bent.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        found = fuse(bent, self._learned.estimate(frame), self._stereo.estimate(frame))
+        found = fuse_with_stereo(bent, self._learned.estimate(frame), self._stereo.estimate(frame))
         return replace(found, depth=found.depth * np.float32(self._scale.value))
 
     def figures(self) -> dict[str, Any]:
@@ -134,7 +134,7 @@ def sharpen_steps(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.divide(1, sharp, out=np.zeros_like(depth), where=depth > 0)
 
 
-def fuse(bent: NDArray[np.float32], learned: DepthEstimate, geometry: DepthEstimate) -> DepthEstimate:
+def fuse_with_stereo(bent: NDArray[np.float32], learned: DepthEstimate, geometry: DepthEstimate) -> DepthEstimate:
     """One frame's depth from the bent depth of the network, in the unit of the geometry, and what the geometry says:
     their mean by their variances where they agree, and where not, the likelier one.
 
@@ -161,8 +161,7 @@ def fuse(bent: NDArray[np.float32], learned: DepthEstimate, geometry: DepthEstim
 
 
 def _spread(off: NDArray[np.floating], raw: NDArray[np.floating], sure: NDArray[np.bool_]) -> NDArray[np.floating]:
-    """(h, w) relative standard deviation of the bent network's depth: how far it is `off` where the geometry is sure,
-    and far from there a part of how far it was before it was bent, `raw`."""
+    """(h, w) relative standard deviation of the bent network's depth."""
     if not sure.any():
         return np.full(off.shape, _UNKNOWN_SPREAD)
     near = float(np.quantile(np.abs(off[sure]), 0.84)) / 1.4

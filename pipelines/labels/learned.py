@@ -15,7 +15,7 @@ from ..networks.outputs import best_classes, class_token, network_probabilities,
 from ..networks.session import Network, card_identity
 from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, class_colors, resample_linear
 from ..types import VOID, ClassTable, Frame
-from .named import NamedScene, Vocabulary
+from .named import NamedScene, NetworkClasses
 from .segments import SegmentLabels
 
 _SAMPLE = 20000
@@ -74,11 +74,11 @@ class OnnxLabels(SemanticsProvider):
         self._learn(frames)
         if self._has_world(frames, depth_of):
             segments = SegmentLabels(self._sequence, self._limit, self._progress)
-            vocabulary = Vocabulary(self._names, self._void, self._limit)
+            vocabulary = NetworkClasses(self._names, self._void, self._limit)
             self._scene = NamedScene.gather(segments, frames, depth_of, self._probabilities, vocabulary)
             names, kept = self._scene.names, self._scene.kept
         else:
-            kept = self._settle_alone(frames)
+            kept = self._settle_unposed(frames)
             names = tuple(self._names[i] for i in kept)
         if not 0 < len(names) < VOID:
             raise InputError(f"{self.name}: {len(names)} classes occur; 1 to {VOID - 1} are needed. Check the card")
@@ -89,7 +89,7 @@ class OnnxLabels(SemanticsProvider):
         posed = [f for f in frames if f.id in self._sequence.cam_from_world]
         return sum(bool((depth_of(f).confidence > 0.3).any()) for f in posed[:: max(1, len(posed) // 10)]) >= 2
 
-    def _settle_alone(self, frames: list[Frame]) -> NDArray[np.int64]:
+    def _settle_unposed(self, frames: list[Frame]) -> NDArray[np.int64]:
         """(K,) the classes that occur in the frames by themselves."""
         counts = np.zeros(len(self._names) + 1, np.int64)
         for frame in frames:

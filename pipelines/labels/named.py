@@ -54,7 +54,7 @@ _MIN_SHARE = 0.0005
 
 
 @dataclass(frozen=True)
-class Vocabulary:
+class NetworkClasses:
     """The network's names; `void`: those that say nothing; `limit`: numbered objects fill up to this many classes."""
 
     names: tuple[str, ...]
@@ -79,7 +79,7 @@ class NamedScene:
         frames: list[Frame],
         depth_of: Callable[[Frame], DepthEstimate],
         probabilities_of: Callable[[Frame], NDArray[np.float32]],
-        vocabulary: Vocabulary,
+        vocabulary: NetworkClasses,
     ) -> NamedScene:
         """All frames vote; `probabilities_of` gives (rows, columns, C) over the frame's image, 0 for nothing said."""
         sequence = segments.sequence
@@ -131,11 +131,7 @@ def _vote(
     depth: DepthEstimate,
     probabilities: NDArray[np.float32],
 ) -> NDArray[np.float64]:
-    """Add one frame's vote: to every voxel the mean of what it says of it, times at most one; last column: how much.
-    Returns the share (C,) of the frame's pixels that show no known place, by their likeliest class.
-
-    Means of probabilities, not of their logarithms: one view's firm mistake must not veto what the others saw.
-    """
+    """Add one frame's vote: to every voxel the mean of what it says of it, times at most one; last column: how much."""
     rows, columns, classes = probabilities.shape
     at = find(voxels.keys, _keys(sequence, frame, resample_nearest(depth.depth, rows, columns), voxels.size))
     confidence = resample_nearest(depth.confidence, rows, columns)
@@ -158,7 +154,7 @@ def _agreed(votes: NDArray[np.float32], patch: NDArray[np.int64]) -> NDArray[np.
 
 
 def _settle(
-    share: NDArray[np.float32], voxels: Voxels, vocabulary: Vocabulary, elsewhere: NDArray[np.float64]
+    share: NDArray[np.float32], voxels: Voxels, vocabulary: NetworkClasses, elsewhere: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], tuple[str, ...], NDArray[np.int64]]:
     """(V, K) shares of the names that occur, and of the objects into which what has none is cut; names; kept (K,)."""
     best, said = share.argmax(1), share.sum(1) > 0
@@ -208,8 +204,7 @@ def disputed(label: NDArray, names: tuple[str, ...], voxels: Voxels) -> NDArray[
 def _things(
     label: NDArray, names: tuple[str, ...], voxels: Voxels
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]]:
-    """For each set of alike names: their indices (M,), the voxels (I,) that bear one, and for each of these which of
-    the names most of its thing bears, -1 where too little of it does."""
+    """Each set of alike names: indices (M,), voxels (I,) that bear one, the name that wins there or -1."""
     for alike in _ALIKE:
         members = np.flatnonzero([n.lower() in alike for n in names])
         inside = np.flatnonzero(np.isin(label, members))

@@ -123,9 +123,9 @@ def read_card(path: Path) -> Card:
             raise InputError(f'{path}: the card lacks {key} = "…"')
     for key in _FILES:
         if isinstance(values.get(key), str):
-            values[key] = _beside(path, values[key])
+            values[key] = _in_folder(path, values[key])
     if isinstance(values.get("classes"), str):
-        table = read_class_table(_beside(path, values["classes"]))
+        table = read_class_table(_in_folder(path, values["classes"]))
         values["classes"] = [table[i].name if i in table else f"class {i}" for i in range(max(table) + 1)]
     return card_from_values(values, path)
 
@@ -151,7 +151,7 @@ def _read(path: Path) -> dict[str, Any]:
     return values
 
 
-def _beside(path: Path, name: str) -> Path:
+def _in_folder(path: Path, name: str) -> Path:
     """A file in the card's own folder; a card from elsewhere must not name files all over the disk."""
     folder = path.parent.resolve()
     with parsing(path, "card that names a file", "correct it"):

@@ -91,8 +91,7 @@ def plain_confidence(
 def _normals(
     network: Network, outputs: dict[str, NDArray], box: Letterbox, depth: NDArray[np.float32], intrinsics: Intrinsics
 ) -> NDArray[np.float32] | None:
-    """(h, w, 3) unit normals that face the camera; None where the network gives none, or none that fit its depth
-    (then its axes are not ours)."""
+    """(h, w, 3) unit normals that face the camera."""
     given = outputs.get("normals")
     if given is None or given.ndim != 3 or 3 not in (given.shape[0], given.shape[2]):
         return None

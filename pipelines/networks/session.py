@@ -105,10 +105,7 @@ def _outputs(card: Card) -> dict[str, str]:
 
 
 def _with_metadata(card: Card, metadata: dict[str, str]) -> Card:
-    """The card with the mean and std that the file itself states, in units of white; its own where there are none.
-
-    Keys that hold the words and three numbers are taken, whatever else they are called; numbers over 5 are of 0..255.
-    """
+    """The card with the mean and std that the file itself states, in units of white; its own where there are none."""
     found: dict[str, tuple[float, ...]] = {}
     for word in ("mean", "std"):
         for key, text in sorted(metadata.items()):
@@ -248,9 +245,9 @@ def card_identity(card: Card) -> str:
 
 @functools.lru_cache(maxsize=32)
 def _identity(card: Card, _: tuple[tuple[int, int], ...]) -> str:
-    beside = []
+    external = []
     if not is_tflite(card.model):  # those carry all of their weights
-        beside = [card.model.parent / name for name in external_locations(card.model)]
-    files = [*filter(None, (card.model, card.head, card.text, card.tokenizer)), *beside]
+        external = [card.model.parent / name for name in external_locations(card.model)]
+    files = [*filter(None, (card.model, card.head, card.text, card.tokenizer)), *external]
     contract = repr(replace(card, model=Path(card.model.name), head=None, text=None, tokenizer=None))
     return hashlib.sha256((contract + files_sha256((p.name, p) for p in files)).encode()).hexdigest()

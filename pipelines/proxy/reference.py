@@ -145,11 +145,7 @@ def _picture_index(source: Recording, picture: str) -> int:
 
 
 def _follow(first: NDArray[np.uint8], second: NDArray[np.uint8], points: Array) -> Array | None:
-    """(2, 2) the points of one image in another, by optical flow there and back; None where one is lost.
-
-    The first is an image of the source, the second a frame without lens distortion: also between equal instants
-    points move a little.
-    """
+    """(2, 2) the points of one image in another, by optical flow there and back."""
     a, b = to_grey(first), to_grey(second)
     if np.array_equal(a, b):
         return points

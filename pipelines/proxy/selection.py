@@ -127,8 +127,7 @@ def open_depth(around: ProviderContext) -> DepthProvider:
 
 
 def _wants_fusion(around: ProviderContext, choice: Choice, learned: DepthProvider) -> bool:
-    """Whether the depth gains from multi-view depth: a network's does; that of files may come from a sensor, or from a
-    network that somebody ran before, and the points of structure from motion decide which."""
+    """Whether the depth gains from multi-view depth: a network's does."""
     if around.config.fuse != "learned" or choice.card is not None:
         return around.config.fuse != "never"
     from ..depth.fused import measure_scale
@@ -190,8 +189,7 @@ def open_label_files(around: ProviderContext, folder: str) -> FilesLabels | Reco
 
 
 def _turns_of(around: ProviderContext) -> dict[int, int]:
-    """Frame id → anticlockwise quarter turns by which its photo is read otherwise than upright, where it is: those of a
-    phone that was turned between them are all turned alike."""
+    """Frame id → anticlockwise quarter turns by which its photo is read otherwise than upright, where it is."""
     if around.recording is not None or not around.source.is_dir():
         return {}
     photos = FolderRecording(around.source)
@@ -210,8 +208,7 @@ def _read(text: str) -> Card:
 
 
 def _cached(task: str, largest: bool) -> Card | None:
-    """The card of the first learned model whose weights are in the cache, or of the one of the largest weights; nothing
-    is ever downloaded here."""
+    """The card of the first learned model whose weights are in the cache, or of the one of the largest weights."""
     store = ModelStore.open()
     model = max(store.all_here(task), key=lambda m: m.bytes, default=None) if largest else store.first_here(task)
     return None if model is None else store.card(model)

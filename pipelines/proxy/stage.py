@@ -18,12 +18,12 @@ from ..types import VOID, Frame
 from .reference import ReferenceScale, reference_scale, scale_figures
 from .tasks import (
     ProxyWork,
+    find_moving_in,
     in_frames,
-    look_for_depth,
-    look_for_labels,
-    look_for_moving,
     make_depths,
     make_maps,
+    precompute_depth,
+    precompute_labels,
 )
 
 _MOSTLY_MATCHED = 0.55
@@ -69,9 +69,7 @@ class ProxyStage:
         return self.work.posed(sequence.frames)
 
     def _warn_of_missing(self) -> None:
-        """Warn of frames without a map, and of map files that show the lens distortion which the frames have lost.
-
-        Raises InputError where no frame has a map."""
+        """Warn of frames without a map, and of map files that show the lens distortion which the frames have lost."""
         for kind, provider in (("depth", self.work.depths), ("label", self.work.semantics)):
             missing = provider.missing(self.frames)
             if len(missing) == len(self.frames):
@@ -90,7 +88,7 @@ class ProxyStage:
 
     def _compute_depths(self) -> None:
         """Compute the depth of every frame and store it in the snapshot."""
-        in_frames(self.work, look_for_depth, self.frames)
+        in_frames(self.work, precompute_depth, self.frames)
         self.work.depths.fit(self.frames)
         in_frames(self.work, make_depths, self.frames, depths=dump_state(self.work.depths))
 
@@ -112,14 +110,14 @@ class ProxyStage:
     def _compute_maps(self, scale: DepthScale, reference: ReferenceScale | None) -> None:
         """Compute labels and the stored maps of every frame, in metres where there is a `reference`."""
         folder, semantics = self.context.folder, self.work.semantics
-        in_frames(self.work, look_for_labels, self.frames)
+        in_frames(self.work, precompute_labels, self.frames)
         semantics.fit(self.frames, lambda frame: scale.in_backbone_unit(self.work.depth(frame)))
         for message in semantics.warnings():
             self.warn(message)
         CLASSES.save(folder, semantics.classes())
         metres = reference.factor if reference else 1.0
         made = in_frames(self.work, make_maps, self.frames, scale=scale, metres=metres, semantics=dump_state(semantics))
-        if descriptors := {i: looks for part in made for i, looks in part.items()}:
+        if descriptors := {i: descriptor for part in made for i, descriptor in part.items()}:
             DESCRIPTORS.save(folder, descriptors)
         scales = scale.of_frame.items()
         FRAME_SCALES.save(
@@ -127,8 +125,7 @@ class ProxyStage:
         )
 
     def _warn_of_focal(self, network_focal: float | None) -> None:
-        """Warn where the depth network sees quite another focal length than the calibration has: from one image it is
-        good to some per cent, and can only doubt a calibration."""
+        """Warn where the depth network sees quite another focal length than the calibration has."""
         calibration = self.work.sequence.calibration
         focal = calibration.intrinsics.fx
         if network_focal is None or calibration.origin == "given" or abs(network_focal / focal - 1) < 0.15:
@@ -149,12 +146,11 @@ class ProxyStage:
             )
 
     def _leave_out_moving(self, scale: DepthScale) -> dict[str, float | int]:
-        """Store masks of what moved; return in how many frames, and how much of those. Made anew from the depth when
-        resumed."""
+        """Store masks of what moved; return in how many frames, and how much of those."""
         if self.context.config.proxy.moving != "auto":
             return {}
         posed = self.work.posed(self.frames)
-        seen = in_frames(self.work, look_for_moving, posed, scale=scale)
+        seen = in_frames(self.work, find_moving_in, posed, scale=scale)
         first = {k: moved for part in seen for k, moved in part.items()}
         found = find_moving(*self.work.moving_views(posed, scale), self.context.progress, first)
         full = self.work.sequence.calibration.intrinsics

@@ -135,7 +135,7 @@ def _opened(task: Chunk, progress: Progress) -> tuple[ProxyWork, list[Frame]]:
     return work, [f for f in work.sequence.frames if f.id in wanted]
 
 
-def look_for_depth(task: Chunk, progress: Progress) -> None:
+def precompute_depth(task: Chunk, progress: Progress) -> None:
     """Run the slow passes of the depth provider over single frames."""
     work, frames = _opened(task, progress)
     work.depths.precompute(frames[task.first : task.last])
@@ -150,13 +150,13 @@ def make_depths(task: Chunk, progress: Progress) -> None:
         pass
 
 
-def look_for_moving(task: Chunk, progress: Progress) -> dict[int, NDArray[np.bool_]]:
+def find_moving_in(task: Chunk, progress: Progress) -> dict[int, NDArray[np.bool_]]:
     """The first round of `find_moving` over the frames."""
     work, frames = _opened(task, progress)
     return find_moving_once(task.numbers, *work.moving_views(frames, task.known["scale"]), progress)
 
 
-def look_for_labels(task: Chunk, progress: Progress) -> None:
+def precompute_labels(task: Chunk, progress: Progress) -> None:
     """Run the network for labels over single frames."""
     work, frames = _opened(task, progress)
     work.semantics.precompute(frames[task.first : task.last])
@@ -180,5 +180,5 @@ def make_maps(task: Chunk, progress: Progress) -> dict[int, NDArray[np.float32]]
         return frame.id, labels.descriptor
 
     made = map_lookahead(make, frames[task.first : task.last], work.context.threads)
-    looks = progress.track(made, "classes", len(task.numbers))
-    return {frame_id: descriptor for frame_id, descriptor in looks if descriptor is not None}
+    found = progress.track(made, "classes", len(task.numbers))
+    return {frame_id: descriptor for frame_id, descriptor in found if descriptor is not None}

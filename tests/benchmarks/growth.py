@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.pipelines.depth.align import fit_fields
 from msgs_slam.pipelines.depth.fields import contradicted
-from msgs_slam.pipelines.depth.stereo.consistency import choose_neighbours, depth_range
+from msgs_slam.pipelines.depth.stereo.consistency import choose_neighbours, sweep_range
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import pixel_centers, project
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth, neighbours
@@ -113,7 +113,7 @@ def _surface_points(rng: np.random.Generator, number: int) -> NDArray[np.float64
 
 def _stereo(s: Synthetic) -> None:
     for index in range(0, s.count, max(s.count // 60, 1)):  # every keyframe costs the same
-        depth_range(s.model, index, choose_neighbours(s.model, CAMERA, index, 6, 8.0))
+        sweep_range(s.model, index, choose_neighbours(s.model, CAMERA, index, 6, 8.0))
 
 
 def _loops_by_look(s: Synthetic) -> None:

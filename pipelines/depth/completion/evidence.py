@@ -113,8 +113,7 @@ def _walk_lines(
     weight: Array,
     support: NDArray[np.int32],
 ) -> None:
-    """Along rows and columns both ways: the last sure value (kinds 3 to 6), and the line through those before it on the
-    same surface (7 to 10)."""
+    """Along rows and columns both ways: the last sure value (kinds 3 to 6), the line through those before (7 to 10)."""
     height, width = values.shape
     for way in range(4):
         upright = way >= 2
@@ -213,8 +212,7 @@ def _stacked(views: list[HalfResKeyframe]) -> tuple[Array, Array, Array]:
 
 
 def _describe_places(pixels: NDArray[np.int64], own: HalfResKeyframe, mass: Array, sure: NDArray[np.bool_]) -> Bytes:
-    """Return (P, OF_PLACE) for flat indices (P,); mass and sure (h, w) as of `find_candidates`: confidence of the
-    match, agreement of others, distance to what is sure, contrast, roughness and density of the matches around."""
+    """Return (P, OF_PLACE) for flat indices (P,); mass and sure (h, w) as of `find_candidates`."""
     far = cv2.distanceTransform((~sure).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     around = np.maximum(cv2.medianBlur(own.inverse, 5), 1e-9)
     away = np.minimum(np.abs(np.log(np.maximum(own.inverse, 1e-9) / around)), np.float32(0.5))
@@ -235,8 +233,7 @@ def _as_byte(value: float) -> int:
 def _weigh_support(
     pixels: NDArray[np.int64], support: NDArray[np.int32], weight: Array, lab: Array, out: Bytes
 ) -> None:
-    """Features 0 to 2: how far off the sure pixel is that a candidate comes from, how different its colour, and how
-    much there is behind it."""
+    """Features 0 to 2: distance to the supporting pixel, difference of its colour, and its weight."""
     width = lab.shape[1]
     for p in range(len(pixels)):
         y, x = pixels[p] // width, pixels[p] % width
@@ -261,8 +258,7 @@ def _ask_views(
     warps: NDArray[np.float64],
     out: Bytes,
 ) -> None:
-    """Features 3 to 12: in how many views the candidate is on, in front of and behind what they surely see there, on
-    and in front of what they matched unsurely, seen at all; how much the colours differ there."""
+    """Features 3 to 12: shares of views that see the depth on, before or behind theirs, and colour differences there."""
     views, width, votes, ray = len(seen), seen.shape[2], np.zeros(9), np.zeros((len(seen), 3))
     for p in range(len(pixels)):
         y, x = pixels[p] // width, pixels[p] % width
@@ -311,8 +307,7 @@ def _vote(
     colors: Array,
     votes: NDArray[np.float64],
 ) -> None:
-    """Add what view v says of depth z along the ray of a pixel: on, through, behind, weakly on, weakly through what it
-    has there, inside of it, not hidden, difference of colour; and lessen the least difference of colour."""
+    """Add what view v says of depth z along the ray of a pixel."""
     # Whole arrays are passed: each part of one is an object to numba, and counting its references takes longest.
     height, width = seen.shape[1:]
     qz = z * ray[v, 2] + warps[v, 2, 3]

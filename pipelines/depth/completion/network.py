@@ -152,11 +152,11 @@ class CompletionNetwork(nn.Module):
         self.up = nn.ModuleList(_Block(b + a, a) for a, b in itertools.pairwise(w))
         self.out = nn.Conv2d(w[0], 2 * _CONTEXT + 1, 1)
 
-    def read(self, evidence: Tensor, place: Tensor, beside: Tensor, real: Tensor) -> Tensor:
+    def read(self, evidence: Tensor, place: Tensor, by_depth: Tensor, real: Tensor) -> Tensor:
         """Read candidates by numbers (P, K, OF_CANDIDATE), (P, OF_PLACE) and (P, K, 3): (P, K, hidden), 0 where there
         is none."""
         of_candidate, of_place, of_depth, of_kind = self.first.weight.split(_COLUMNS, 1)
-        hidden = torch.cat([evidence, beside], -1) @ torch.cat([of_candidate, of_depth], 1).T
+        hidden = torch.cat([evidence, by_depth], -1) @ torch.cat([of_candidate, of_depth], 1).T
         # No ones and zeros are made for the kinds, and the place is read once.
         hidden = hidden.add_(of_kind.T).add_(F.linear(place, of_place, self.first.bias)[:, None])
         return hidden.relu_() * real[..., None]
@@ -166,7 +166,7 @@ class CompletionNetwork(nn.Module):
         mean = hidden.sum(1) / real.sum(1, keepdim=True).clamp(min=1)
         return self.around(torch.cat([mean, hidden.amax(1)], -1)).relu_()
 
-    def look_around(self, planes: Tensor, pixels: Tensor, gathered: Tensor) -> Tensor:
+    def find_context(self, planes: Tensor, pixels: Tensor, gathered: Tensor) -> Tensor:
         """Return (B, h, w, 2 C + 1): context for candidates and for the image's own depth, log spread of what is sure;
         of B keyframes' planes (B, 10, h, w) and what was gathered at pixels (P,) of all of them, one after another."""
         batch, _, height, width = planes.shape
@@ -186,19 +186,19 @@ class CompletionNetwork(nn.Module):
 
     def weigh(self, hidden: Tensor, real: Tensor, gathered: Tensor, context: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return log probability, correction of the log inverse depth and log spread (P, K + 1) of the candidates and
-        of the image's own depth, which starts from the first candidate; context (P, 2 C) as of `look_around`."""
+        of the image's own depth, which starts from the first candidate; context (P, 2 C) as of `find_context`."""
         mine = context[:, :_CONTEXT] + self.pixel(gathered)
         each = self.last(self.second(hidden).add_(mine[:, None]).relu_()).float()
-        alone = self.alone((context[:, _CONTEXT:] + mine).relu_()).float()
-        share = torch.cat([each[..., 0].masked_fill(~real, _NEVER), alone[:, :1]], 1)
-        moved = torch.cat([_MOST_CORRECTION * torch.tanh(each[..., 1]), alone[:, 1:2].clamp(-3, 3)], 1)
-        spread = torch.cat([each[..., 2], alone[:, 2:]], 1).clamp(-4.8, -0.3)
+        whole = self.alone((context[:, _CONTEXT:] + mine).relu_()).float()
+        share = torch.cat([each[..., 0].masked_fill(~real, _NEVER), whole[:, :1]], 1)
+        moved = torch.cat([_MOST_CORRECTION * torch.tanh(each[..., 1]), whole[:, 1:2].clamp(-3, 3)], 1)
+        spread = torch.cat([each[..., 2], whole[:, 2:]], 1).clamp(-4.8, -0.3)
         return torch.log_softmax(share, 1), moved, spread
 
     @staticmethod
     def _numbers(given: Inputs, block: slice) -> tuple[Tensor, Tensor, Tensor]:
-        beside = compare(given.logs[block], given.real[block])
-        return numbers_of(given.evidence[block]), numbers_of(given.place[block]), beside
+        by_depth = compare(given.logs[block], given.real[block])
+        return numbers_of(given.evidence[block]), numbers_of(given.place[block]), by_depth
 
     @torch.no_grad()
     def evaluate(self, given: Inputs) -> Mixture:
@@ -208,7 +208,7 @@ class CompletionNetwork(nn.Module):
         read = [self.read(*self._numbers(given, b), given.real[b]) for b in blocks]
         gathered = [self.gather(h, given.real[b]) for h, b in zip(read, blocks, strict=True)]
         planes = given.planes[None].contiguous(memory_format=torch.channels_last)
-        around = self.look_around(planes, given.pixels, torch.cat(gathered))[0]
+        around = self.find_context(planes, given.pixels, torch.cat(gathered))[0]
         context = around[..., :-1].flatten(0, 1)[given.pixels]
         parts = [self.weigh(h, given.real[b], g, context[b]) for h, g, b in zip(read, gathered, blocks, strict=True)]
         share, moved, spread = (torch.cat(column) for column in zip(*parts, strict=True))

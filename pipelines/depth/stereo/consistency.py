@@ -47,8 +47,7 @@ def fuse_depths(
 
 @inner
 def _sample(depth: NDArray[np.float32], width: int, height: int, px: Any, py: Any, tolerance: np.float32) -> object:
-    """Of a flat depth map: inverse-depth interpolation where the four neighbours of the places lie on one surface, else
-    the nearest pixel's depth."""
+    """Sample a flat depth map: interpolated within one surface, else the nearest pixel."""
     right, bottom = np.float32(width - 1), np.float32(height - 1)
     whole = (px >= _ZERO) & (py >= _ZERO) & (px < right) & (py < bottom)
     inner_x = min_scalar(maximum(px, splat(_ZERO)), right - _RIM)
@@ -169,7 +168,7 @@ def _candidates(model: SparseModel, index: int) -> NDArray[np.int64]:
     return found[found != index]
 
 
-def depth_range(model: SparseModel, index: int, companions: NDArray[np.int64]) -> tuple[float, float] | None:
+def sweep_range(model: SparseModel, index: int, companions: NDArray[np.int64]) -> tuple[float, float] | None:
     """(near, far) that hold the depths of keyframe `index`, with a margin; None with too few points to say.
 
     Points of the companion views that lie in front count as well: a keyframe may have few of its own.

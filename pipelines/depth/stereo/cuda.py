@@ -29,10 +29,10 @@ def takes_kernels_on(device: str) -> bool:
 
 def match_planes(images: rules.StereoImages, planes: NDArray[np.float64], device: str) -> Array:
     """Return what `matching.match_planes` does, but for rounding."""
-    step, fine = planes[1] - planes[0], Matching.of(images, device)
+    step, fine = planes[1] - planes[0], CudaMatcher.of(images, device)
     tried = _planes_near(images, planes, rules.SMALL_STEP, device)
     total = fine.smoothed(leave_out(fine.cost(planes), tried), rules.SMALL_STEP)
-    inverse = fine.picked(total, planes)
+    inverse = fine.best_planes(total, planes)
     inverse = fine.refined(fine.soften(inverse, rules.SOFT_VALUES[0] * step), rules.MOVE * step)
     return fine.soften(inverse, rules.SOFT_VALUES[1] * step).cpu().numpy()
 
@@ -41,13 +41,13 @@ def _planes_near(
     images: rules.StereoImages, planes: NDArray[np.float64], small_step: float, device: str
 ) -> NDArray[np.bool_]:
     step, size, few = planes[1] - planes[0], images.image.shape, planes[:: rules.COARSE]
-    coarse = Matching.of(small := images.halved(), device)
+    coarse = CudaMatcher.of(small := images.halved(), device)
     cost = coarse.cost(few)
     if rules.is_large(small):
         cost = leave_out(cost, _planes_near(small, few, rules.COARSE * small_step, device))
-    found = (coarse.picked(coarse.smoothed(cost, rules.COARSE * small_step), few).cpu().numpy() - planes[0]) / step
-    alone, least = (x.cpu().numpy() for x in (cost.argmin(2), cost.amin(2)))
-    return rules.planes_to_try(found.astype(np.float32), rules.COARSE * alone, least, size, len(planes))
+    found = (coarse.best_planes(coarse.smoothed(cost, rules.COARSE * small_step), few).cpu().numpy() - planes[0]) / step
+    own, least = (x.cpu().numpy() for x in (cost.argmin(2), cost.amin(2)))
+    return rules.planes_to_try(found.astype(np.float32), rules.COARSE * own, least, size, len(planes))
 
 
 def leave_out(cost: Tensor, tried: NDArray[np.bool_]) -> Tensor:
@@ -78,7 +78,7 @@ def fuse_depths(
     return fused, support, conflict
 
 
-class Matching:
+class CudaMatcher:
     """The steps of the match: a picture (H, W), others (N, H, W) and their warps (N, 12), float32 on a GPU."""
 
     def __init__(self, image: Tensor, others: Tensor, warps: Tensor) -> None:
@@ -90,11 +90,11 @@ class Matching:
         }  # fmt: skip
 
     @classmethod
-    def of(cls, images: rules.StereoImages, device: str) -> Matching:
+    def of(cls, images: rules.StereoImages, device: str) -> CudaMatcher:
         """StereoImages of the host, there."""
         return cls(*(_there(x, device) for x in (images.image, images.others, images.warps.reshape(-1, 12))))
 
-    def picked(self, total: Tensor, planes: NDArray[np.float64]) -> Tensor:
+    def best_planes(self, total: Tensor, planes: NDArray[np.float64]) -> Tensor:
         """(H, W) inverse depth of least total cost (H, W, D)."""
         from .cuda_kernels import pick_pixels
 

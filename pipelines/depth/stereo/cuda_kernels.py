@@ -274,7 +274,7 @@ def fuse_pixels(
         safe = tl.where(shown, far, 1.0)
         across, down = x / safe, y / safe
         shown = shown & (across >= 0) & (down >= 0) & (across < width) & (down < height)
-        seen = sample_surface(others + n * width * height, across - 0.5, down - 0.5, shown, width, height, TOLERANCE)
+        seen = sample_depth(others + n * width * height, across - 0.5, down - 0.5, shown, width, height, TOLERANCE)
         shown = shown & (seen > 0)
         off = (seen - safe) / safe
         against += tl.where(shown & (off > 4 * TOLERANCE), 1.0, 0.0)
@@ -290,7 +290,7 @@ def fuse_pixels(
 
 
 @triton.jit
-def sample_surface(
+def sample_depth(
     depth: tl.tensor, across: tl.tensor, down: tl.tensor, inside: tl.tensor, width: tl.tensor, height: tl.tensor,
     TOLERANCE: tl.constexpr,
 ) -> tl.tensor:  # fmt: skip

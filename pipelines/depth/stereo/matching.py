@@ -52,7 +52,7 @@ def match_planes(images: StereoImages, planes: NDArray[np.float64], bands: Bands
     """(H, W) inverse depth of the image, found among the inverse depths `planes` (D,), which are evenly spaced, and
     refined.
 
-    Planes are tried near those of a match at half the size alone: an eighth of them.
+    Planes are tried near those of a match at half the size own: an eighth of them.
     """
     step, best = planes[1] - planes[0], best_count(len(images.others))
     cost = sweep_cost(*images, planes, best, bands, _planes_near(images, planes, SMALL_STEP, bands))
@@ -73,8 +73,8 @@ def _planes_near(
     tried = _planes_near(small, few, COARSE * small_step, bands) if is_large(small) else None
     cost = sweep_cost(*small, few, best_count(len(images.others)), bands, tried)
     found = pick_planes(smooth_cost(cost, small.image, COARSE * small_step, JUMP, EDGE, bands))
-    alone, least = least_planes(cost)
-    return planes_to_try(COARSE * found, COARSE * alone, least, images.image.shape, len(planes))
+    own, least = least_planes(cost)
+    return planes_to_try(COARSE * found, COARSE * own, least, images.image.shape, len(planes))
 
 
 def is_large(images: StereoImages) -> bool:
@@ -84,7 +84,7 @@ def is_large(images: StereoImages) -> bool:
 
 def planes_to_try(
     found: NDArray[np.float32],
-    alone: NDArray[np.int64],
+    own: NDArray[np.int64],
     least: NDArray[np.float32],
     size: tuple[int, ...],
     planes: int,
@@ -92,13 +92,13 @@ def planes_to_try(
     """(tiles down, tiles across, D) of an image of that size (H, W): the planes near those of a coarse match (h, w),
     in a tile and just beside it.
 
-    `found` (h, w) are its planes, and those of least cost `alone` (h, w) count where that `least` cost is clear: what
+    `found` (h, w) are its planes, and those of least cost `own` (h, w) count where that `least` cost is clear: what
     is thin is smoothed away.
     """
     height, width = found.shape
     tried = np.zeros((*tiles_of(size[0], size[1]), planes), np.bool_)
     sure = least < CLEAR
-    places = ((np.round(found).astype(np.int64), np.ones_like(sure)), (alone, sure))
+    places = ((np.round(found).astype(np.int64), np.ones_like(sure)), (own, sure))
     rows, columns = np.mgrid[:height, :width]
     for down, across in product((-AROUND, 0, AROUND), repeat=2):
         row = np.clip(rows + down, 0, height - 1) * size[0] // height // TILE

@@ -34,7 +34,7 @@ from ..completion.evidence import (
 )
 from ..completion.fill import SURE, evidence_of, smooth_confidence
 from ..completion.network import HALF, TWICE, complete, completed_keyframe, halved, to_confidence
-from .consistency import choose_neighbours, depth_range, fuse_depths
+from .consistency import choose_neighbours, fuse_depths, sweep_range
 from .matching import StereoImages, match_planes
 from .sweep import warps_to
 from .volume import Bands
@@ -122,7 +122,7 @@ class MultiviewDepth:
         """(H, W) inverse depth of one keyframe from its neighbours alone; 0 where nothing matches."""
         camera = self.camera
         companions = self._neighbours(index, _VIEWS)
-        limits = depth_range(self._model, index, companions[:_RANGE_VIEWS])
+        limits = sweep_range(self._model, index, companions[:_RANGE_VIEWS])
         if len(companions) == 0 or limits is None:
             return np.zeros((camera.height, camera.width), np.float32)
         planes = np.linspace(1 / limits[1], 1 / limits[0], self._planes)

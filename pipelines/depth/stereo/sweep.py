@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...compute.lanes import splat, store
 from ...compute.threads import fused_kernel, inner
 from .lane_sampling import with_row_below
-from .volume import BLOCK, TILE, UNREACHED, Bands, Volume, pixel_of_tile, tiles_of
+from .volume import BLOCK, TILE, UNREACHED, Bands, CostVolume, pixel_of_tile, tiles_of
 from .window import (
     LIKENESS,
     RADIUS,
@@ -54,7 +54,7 @@ def sweep_cost(
     best: int,
     bands: Bands,
     tried: NDArray[np.bool_] | None = None,
-) -> Volume:
+) -> CostVolume:
     """Compute the cost, 1 - score, in [0, 2]. Where no view sees the point it is 1, as for a surface without texture.
 
     Args:
@@ -69,7 +69,7 @@ def sweep_cost(
     height, width = image.shape
     if tried is None:
         tried = np.ones((*tiles_of(height, width), len(inverse_depths)), np.bool_)
-    cost, wanted = Volume.of_tried(height, width, tried), np.ascontiguousarray(tried.transpose(0, 2, 1))
+    cost, wanted = CostVolume.of_tried(height, width, tried), np.ascontiguousarray(tried.transpose(0, 2, 1))
     paired = with_row_below(others)
 
     def work(first: int, last: int) -> None:
@@ -140,8 +140,7 @@ def _turn(
     strides: NDArray[np.int64],
     cost: NDArray[np.float32],
 ) -> None:
-    """Planes side by side for each pixel, out of pixels side by side for each plane: writing each plane would miss the
-    cache at every pixel."""
+    """Planes side by side for each pixel, out of pixels side by side for each plane."""
     for t in range(len(places)):
         if places[t] >= 0:
             for k in range(rows):

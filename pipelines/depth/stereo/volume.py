@@ -53,7 +53,7 @@ def tiles_of(height: int, width: int) -> tuple[int, int]:
     return -(-height // TILE), -(-width // TILE)
 
 
-class Volume(NamedTuple):
+class CostVolume(NamedTuple):
     """Numbers of the planes that are tried in an image (height, width).
 
     Each tile has the blocks of planes in which any is tried, pixel after pixel in flat `values` (float32), `strides`
@@ -69,7 +69,7 @@ class Volume(NamedTuple):
     strides: NDArray[np.int64]
 
     @staticmethod
-    def of_tried(height: int, width: int, tried: NDArray[np.bool_]) -> Volume:
+    def of_tried(height: int, width: int, tried: NDArray[np.bool_]) -> CostVolume:
         """Room for the planes `tried` (tiles down, tiles across, D); its values are anything."""
         planes = tried.shape[2]
         filled = np.pad(tried, ((0, 0), (0, 0), (0, -planes % BLOCK)))
@@ -77,9 +77,11 @@ class Volume(NamedTuple):
         strides = BLOCK * there.sum(2)
         ends = TILE * TILE * strides.cumsum().reshape(strides.shape)
         firsts = (ends - TILE * TILE * strides)[..., None] + BLOCK * (there.cumsum(2) - 1)
-        return Volume(height, width, planes, np.empty(ends[-1, -1], np.float32), np.where(there, firsts, -1), strides)
+        return CostVolume(
+            height, width, planes, np.empty(ends[-1, -1], np.float32), np.where(there, firsts, -1), strides
+        )
 
-    def zeros(self) -> Volume:
+    def zeros(self) -> CostVolume:
         """Another of the same shape, of zeros."""
         return self._replace(values=np.zeros_like(self.values))
 
@@ -90,7 +92,7 @@ def pixel_of_tile(y: int, x: int) -> int:
     return y % TILE * TILE + x % TILE
 
 
-def least_planes(volume: Volume) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def least_planes(volume: CostVolume) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """(H, W) plane of least cost, the first of those, and its cost."""
     shape = (volume.height, volume.width)
     index, least = np.empty(shape, np.int64), np.empty(shape, np.float32)
@@ -121,12 +123,12 @@ def _find_least(
             index[y, x], least[y, x] = best, lowest
 
 
-def pick_planes(volume: Volume) -> NDArray[np.float32]:
+def pick_planes(volume: CostVolume) -> NDArray[np.float32]:
     """(H, W) best plane as a fractional index: a parabola through the lowest number and its two neighbours."""
     index, least = least_planes(volume)
-    picked = np.empty(index.shape, np.float32)
-    _pick(volume.values, volume.places, volume.strides, index, least, picked)
-    return picked
+    fractional = np.empty(index.shape, np.float32)
+    _pick(volume.values, volume.places, volume.strides, index, least, fractional)
+    return fractional
 
 
 @kernel
@@ -136,7 +138,7 @@ def _pick(
     strides: NDArray[np.int64],
     index: NDArray[np.int64],
     least: NDArray[np.float32],
-    picked: NDArray[np.float32],
+    fractional: NDArray[np.float32],
 ) -> None:
     height, width = index.shape
     for y in range(height):
@@ -151,7 +153,7 @@ def _pick(
                 bend = a + c - 2 * least[y, x]
                 if bend > 0 and max(a, c) < UNREACHED:
                     offset = min(max((a - c) / (2 * bend), np.float32(-0.5)), np.float32(0.5))
-            picked[y, x] = np.float32(index[y, x]) + offset
+            fractional[y, x] = np.float32(index[y, x]) + offset
 
 
 DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
@@ -161,8 +163,8 @@ _ABREAST = 16
 
 
 def smooth_cost(
-    cost: Volume, image: NDArray[np.float32], small: float, large: float, edge: float, bands: Bands
-) -> Volume:
+    cost: CostVolume, image: NDArray[np.float32], small: float, large: float, edge: float, bands: Bands
+) -> CostVolume:
     """The sum of the path costs, from the matching cost and the reference image (H, W) in 0..1.
 
     A step of one plane costs `small`; a jump costs `large`, less where the intensity steps by about `edge` or more,

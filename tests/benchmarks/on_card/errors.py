@@ -209,7 +209,7 @@ def errors_of_stereo(rows: Rows) -> None:
 
 
 def _stereo_steps(rows: Rows, scene: StereoScene, bands: Bands) -> None:
-    on_card, best = cuda.Matching.of(scene.images, CARD.device), matching.best_count(len(scene.images.others))
+    on_card, best = cuda.CudaMatcher.of(scene.images, CARD.device), matching.best_count(len(scene.images.others))
     cost = on_card.cost(scene.planes)
     exact = to_dense(sweep_cost(*scene.images, scene.planes, best, bands))
     agree(rows, "stereo", "costs", cost, exact, pixels=True)

@@ -361,7 +361,7 @@ def loss_of(network: CompletionNetwork, batch: list[Example]) -> Tensor:
     hidden = network.read(*numbers, real)
     gathered = network.gather(hidden, real)
     planes = _recolored(torch.stack([e.given.planes for e in batch]).float())
-    around = network.look_around(planes.contiguous(memory_format=torch.channels_last), at, gathered)
+    around = network.find_context(planes.contiguous(memory_format=torch.channels_last), at, gathered)
     share, moved, log_spread = network.weigh(hidden, real, gathered, around[..., :-1].flatten(0, 2)[at])
     error = logs - torch.where(known, wanted, 0)[:, None]
     apart = (torch.cat([error, error[:, :1]], 1) + moved).abs()

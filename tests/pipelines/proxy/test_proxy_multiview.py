@@ -13,9 +13,9 @@ from proxy_room import UNIT, Room, write_source
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
 from msgs_slam.pipelines.config import ProxyConfig
-from msgs_slam.pipelines.depth.fused import FusedDepth, fuse, measure_scale, sharpen_steps
+from msgs_slam.pipelines.depth.fused import FusedDepth, fuse_with_stereo, measure_scale, sharpen_steps
 from msgs_slam.pipelines.depth.stereo import provider as stereo_provider
-from msgs_slam.pipelines.depth.stereo.consistency import depth_range
+from msgs_slam.pipelines.depth.stereo.consistency import sweep_range
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.labels.segments import SegmentLabels
 from msgs_slam.pipelines.providers import DepthEstimate, Sequence
@@ -59,7 +59,7 @@ def test_the_range_of_depths_holds_what_is_plain_and_nearer_than_all_points(room
     model = room.sequence().backbone
     assert model is not None
     for index in (0, 4):
-        limits = depth_range(model, index, np.array([index + 1, index + 2]))
+        limits = sweep_range(model, index, np.array([index + 1, index + 2]))
         assert limits is not None
         points = model.points_in_world[model.points_of(index)]
         depths = points @ model.cam_from_world[index, 2, :3] + model.cam_from_world[index, 2, 3]
@@ -215,7 +215,7 @@ def test_two_guesses_that_miss_differently_are_better_together() -> None:
     strays = 1 + 0.08 * (-1.0) ** np.arange(60)[:, None]  # a poor network
     depth = (whole * np.where(np.arange(80) < 40, strays, 0.95)).astype(np.float32)
     learned = DepthEstimate(depth, np.ones_like(whole))
-    fused = fuse(learned.depth, learned, DepthEstimate(guess, confidence))
+    fused = fuse_with_stereo(learned.depth, learned, DepthEstimate(guess, confidence))
     error = np.abs(fused.depth / whole - 1)
     assert error[:, :40].max() < 3e-3
     assert error[:15, 66:].max() < 0.05
@@ -230,7 +230,7 @@ def test_a_portrait_image_is_fused_like_a_landscape_one_on_its_side() -> None:
     def fused(turns: int) -> np.ndarray:
         geometry = DepthEstimate(*(np.rot90(a, turns).astype(np.float32) for a in (2 * ratio, confidence)))
         learned = DepthEstimate(np.full_like(geometry.depth, 2.0), np.ones_like(geometry.depth))
-        return np.rot90(fuse(learned.depth, learned, geometry).depth, -turns)
+        return np.rot90(fuse_with_stereo(learned.depth, learned, geometry).depth, -turns)
 
     np.testing.assert_allclose(fused(1), fused(0), rtol=1e-5)
 

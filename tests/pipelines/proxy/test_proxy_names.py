@@ -12,7 +12,7 @@ from msgs_slam.pipelines.evaluation.labels import count_labels, score
 from msgs_slam.pipelines.geometry import voxels
 from msgs_slam.pipelines.geometry.room_layout import FLOOR, OTHER, Gravity
 from msgs_slam.pipelines.geometry.voxels import Voxels, merge, voxel_keys
-from msgs_slam.pipelines.labels.named import NamedScene, Vocabulary, disputed, name_likelihood, one_name_each
+from msgs_slam.pipelines.labels.named import NamedScene, NetworkClasses, disputed, name_likelihood, one_name_each
 from msgs_slam.pipelines.labels.segments import SegmentLabels
 from msgs_slam.pipelines.networks.outputs import best_classes
 from msgs_slam.pipelines.providers import DepthEstimate, resample_linear
@@ -45,7 +45,7 @@ def depth_of(room: Room, frame: Frame) -> DepthEstimate:
     return DepthEstimate(depth, (depth > 0).astype(np.float32) * 0.8)
 
 
-def gather(room: Room, said: dict[int, NDArray[np.float32]], vocabulary: Vocabulary) -> NamedScene:
+def gather(room: Room, said: dict[int, NDArray[np.float32]], vocabulary: NetworkClasses) -> NamedScene:
     segments = SegmentLabels(room.sequence(), vocabulary.limit, SilentProgress())
     return NamedScene.gather(segments, room.frames, lambda f: depth_of(room, f), lambda f: said[f.id], vocabulary)
 
@@ -53,7 +53,7 @@ def gather(room: Room, said: dict[int, NDArray[np.float32]], vocabulary: Vocabul
 def test_frames_together_name_the_room_better_than_each_alone(room: Room) -> None:
     rng = np.random.default_rng(3)
     said = {f.id: coarse(room.views[f.id].labels, rng) for f in room.frames}
-    scene = gather(room, said, Vocabulary(NAMES, (0,), 16))
+    scene = gather(room, said, NetworkClasses(NAMES, (0,), 16))
     index = np.array([*(NAMES.index(n) if n in NAMES else VOID for n in scene.names)] + [VOID] * 256, np.uint8)
     together, alone = {}, {}
     for frame in room.frames:
@@ -70,7 +70,7 @@ def test_what_has_no_name_becomes_numbered_objects(room: Room) -> None:
     for frame in room.frames:
         labels = np.where(np.isin(room.views[frame.id].labels, known), room.views[frame.id].labels, 0).astype(np.uint8)
         said[frame.id] = coarse(labels, np.random.default_rng(0)) * np.isin(np.arange(len(NAMES)), [0, *known])
-    scene = gather(room, said, Vocabulary(NAMES, (0,), 6))
+    scene = gather(room, said, NetworkClasses(NAMES, (0,), 6))
     assert set(scene.names[:2]) == {"wall", "floor"}
     assert scene.names[2:] == tuple(f"object {i + 1}" for i in range(4))
     assert (scene.kept[2:] == -1).all()
@@ -81,7 +81,7 @@ def test_what_has_no_name_becomes_numbered_objects(room: Room) -> None:
 
 def test_a_frame_without_pose_keeps_what_it_said(room: Room) -> None:
     said = {f.id: coarse(room.views[f.id].labels, np.random.default_rng(1)) for f in room.frames}
-    scene = gather(room, said, Vocabulary(NAMES, (0,), 16))
+    scene = gather(room, said, NetworkClasses(NAMES, (0,), 16))
     elsewhere = replace(room.sequence(), read_image=lambda frame: room.views[0].rgb)
     known = room.views[0].labels
     found = scene.estimate(elsewhere, Frame(99, "lost.png", 9.9, 99, 1.0), depth_of(room, room.frames[0]), said[0])
@@ -101,7 +101,7 @@ def test_a_room_of_which_nothing_is_sure_has_the_names_of_each_frame_alone(room:
 
     said = {f.id: coarse(room.views[f.id].labels, np.random.default_rng(1)) for f in room.frames}
     segments = SegmentLabels(room.sequence(), 16, SilentProgress())
-    scene = NamedScene.gather(segments, room.frames, scattered, lambda f: said[f.id], Vocabulary(NAMES, (0,), 16))
+    scene = NamedScene.gather(segments, room.frames, scattered, lambda f: said[f.id], NetworkClasses(NAMES, (0,), 16))
     assert len(scene.keys) == 0
     assert "wall" in scene.names
     found = scene.estimate(room.sequence(), room.frames[0], scattered(room.frames[0]), said[0])

@@ -48,12 +48,14 @@ def pictures() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def on_card(pictures: tuple[np.ndarray, np.ndarray, np.ndarray]) -> cuda.Matching:
+def on_card(pictures: tuple[np.ndarray, np.ndarray, np.ndarray]) -> cuda.CudaMatcher:
     image, others, warps = pictures
-    return cuda.Matching(*(torch.from_numpy(np.float32(x)).to(DEVICE) for x in (image, others, warps.reshape(-1, 12))))
+    return cuda.CudaMatcher(
+        *(torch.from_numpy(np.float32(x)).to(DEVICE) for x in (image, others, warps.reshape(-1, 12)))
+    )
 
 
-def test_the_sweep_has_the_costs_of_the_cpu(pictures: tuple, on_card: cuda.Matching) -> None:
+def test_the_sweep_has_the_costs_of_the_cpu(pictures: tuple, on_card: cuda.CudaMatcher) -> None:
     found = on_card.cost(PLANES).cpu().numpy()
     expected = to_dense(sweep_cost(*pictures, PLANES, matching.best_count(len(pictures[1])), BANDS))
     assert found.shape == expected.shape
@@ -62,7 +64,7 @@ def test_the_sweep_has_the_costs_of_the_cpu(pictures: tuple, on_card: cuda.Match
     assert (np.abs(found - expected) > 1e-3).mean() < 5e-3
 
 
-def test_paths_are_smoothed_as_on_the_cpu(pictures: tuple, on_card: cuda.Matching) -> None:
+def test_paths_are_smoothed_as_on_the_cpu(pictures: tuple, on_card: cuda.CudaMatcher) -> None:
     cost = np.random.default_rng(1).random((*pictures[0].shape, 19)).astype(np.float32)
     found = on_card.smoothed(torch.from_numpy(cost).to(DEVICE), matching.SMALL_STEP).cpu().numpy()
     dense = of_dense(cost)
@@ -70,21 +72,21 @@ def test_paths_are_smoothed_as_on_the_cpu(pictures: tuple, on_card: cuda.Matchin
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
-def test_planes_that_are_not_tried_are_left_out_as_on_the_cpu(pictures: tuple, on_card: cuda.Matching) -> None:
+def test_planes_that_are_not_tried_are_left_out_as_on_the_cpu(pictures: tuple, on_card: cuda.CudaMatcher) -> None:
     cost = np.random.default_rng(1).random((*pictures[0].shape, 19)).astype(np.float32)
     tried = np.zeros((1, 2, 19), np.bool_)
     tried[0, 0, [2, 3, 6]], tried[0, 1, 9:14] = True, True
     left = cuda.leave_out(torch.from_numpy(cost).to(DEVICE), tried)
     there = of_dense(np.where(tried.repeat(TILE, 0)[:ROWS].repeat(TILE, 1)[:, :COLUMNS], cost, UNREACHED))
     expected = smooth_cost(there, pictures[0], matching.SMALL_STEP, matching.JUMP, matching.EDGE, BANDS)
-    found = on_card.picked(on_card.smoothed(left, matching.SMALL_STEP), PLANES).cpu().numpy()
+    found = on_card.best_planes(on_card.smoothed(left, matching.SMALL_STEP), PLANES).cpu().numpy()
     planes = PLANES[0] + pick_planes(expected) * (PLANES[1] - PLANES[0])
     np.testing.assert_allclose(found, planes, atol=1e-4)
     assert (to_dense(expected)[:, :16, [*range(2), 4, 5, *range(7, 19)]] == UNREACHED).all()
     assert (to_dense(expected)[:, :16, [2, 3, 6]] < UNREACHED).all()
 
 
-def test_the_refinement_and_the_filter_are_those_of_the_cpu(pictures: tuple, on_card: cuda.Matching) -> None:
+def test_the_refinement_and_the_filter_are_those_of_the_cpu(pictures: tuple, on_card: cuda.CudaMatcher) -> None:
     inverse = (0.45 + 0.05 * np.random.default_rng(2).random(pictures[0].shape)).astype(np.float32)
     there = torch.from_numpy(inverse).to(DEVICE)
     expected = refine_inverse_depth(
