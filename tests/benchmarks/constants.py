@@ -38,8 +38,8 @@ AS_IT_IS = "as it is"
 AFTER = {
     "agreeing depths": ("stereo/provider.py", "_TOLERANCE = 0.01", "0.01"),
     "sure from": ("completion/fill.py", "SURE = 0.3", "0.3"),
-    "reach of company": ("completion/fill.py", "_SMOOTH_REACH, _SMOOTH_SD = 3 / 80, 30.0", "3"),
-    "colours of company": ("completion/fill.py", "_SMOOTH_REACH, _SMOOTH_SD = 3 / 80, 30.0", "30.0"),
+    "reach of smoothing": ("completion/fill.py", "_SMOOTH_REACH, _SMOOTH_SD = 3 / 80, 30.0", "3"),
+    "colours of smoothing": ("completion/fill.py", "_SMOOTH_REACH, _SMOOTH_SD = 3 / 80, 30.0", "30.0"),
     "colours of near evidence": (
         "completion/fill.py",
         "_REACHES = ((1 / 16, 30.0, 1.0), (1 / 4, 60.0, 0.1))",
@@ -69,8 +69,8 @@ WITHIN = {
     "jump": ("stereo/matching.py", "SMALL_STEP, JUMP, EDGE = 0.1, 1.2, 0.05", "1.2"),
     "edge of a jump": ("stereo/matching.py", "SMALL_STEP, JUMP, EDGE = 0.1, 1.2, 0.05", "0.05"),
     "stiffness": ("stereo/matching.py", "STIFFNESS = 0.01", "0.01"),
-    "near margin": ("stereo/provider.py", "_NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5", "0.45"),
-    "far margin": ("stereo/provider.py", "_NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5", "1.5"),
+    "near margin": ("stereo/consistency.py", "_NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5", "0.45"),
+    "far margin": ("stereo/consistency.py", "_NEAR_MARGIN, _FAR_MARGIN = 0.45, 1.5", "1.5"),
 }
 
 

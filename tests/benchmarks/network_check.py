@@ -6,6 +6,7 @@ Files of one network go round with and without normalisation in the graph, in me
 opens, and answers with numbers, may still be read wrongly. Here it is seen by its errors. Exit code 1 where it is.
 """
 
+import argparse
 import copy
 import sys
 import tempfile
@@ -304,8 +305,10 @@ def known_view() -> KnownView:
         return KnownView(sequence.rgb(_KNOWN_FRAME), depth, intrinsics, labels, sequence.class_names)
 
 
-def main(names: list[str]) -> None:
-    """Check the named networks, or all that are installed."""
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME|CARD.toml")
+    names = parser.parse_args().names
     store, view, bad = ModelStore.open(), known_view(), False
     installed = [m for m in store.models if "input" in store.families[m.family] and store.is_here(m)]
     is_file = {name: Path(name).suffix.lower() in (".toml", ".json") for name in names}
@@ -319,4 +322,4 @@ def main(names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -258,7 +258,7 @@ def _ask_views(
     warps: NDArray[np.float64],
     out: Bytes,
 ) -> None:
-    """Features 3 to 12: shares of views that see the depth on, before or behind theirs, and colour differences there."""
+    """Features 3 to 12: shares of views that see the depth on, before or behind theirs, and colours there."""
     views, width, votes, ray = len(seen), seen.shape[2], np.zeros(9), np.zeros((len(seen), 3))
     for p in range(len(pixels)):
         y, x = pixels[p] // width, pixels[p] % width

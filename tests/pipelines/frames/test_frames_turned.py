@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from msgs_slam.formats.images import read_rgb, to_grey, write_rgb
-from msgs_slam.pipelines.depth.fields import FINE, Grid, field_scales
+from msgs_slam.pipelines.depth.fields import FINE, FieldGrid, field_scales
 from msgs_slam.pipelines.export.extra.texture import _seen
 from msgs_slam.pipelines.frames.keyframes import choose_keyframes
 from msgs_slam.pipelines.frames.stage import run
@@ -76,8 +76,8 @@ def test_keyframes_have_the_same_poses(bent_walk: Walk, tmp_path: Path) -> None:
     assert np.degrees(np.arccos(np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1))).max() < 0.3
 
 
-@pytest.mark.parametrize("grid", [FINE, Grid(3, 4)])
-def test_nodes_of_a_field_are_as_far_apart(grid: Grid) -> None:
+@pytest.mark.parametrize("grid", [FINE, FieldGrid(3, 4)])
+def test_nodes_of_a_field_are_as_far_apart(grid: FieldGrid) -> None:
     rng = np.random.default_rng(0)
     nodes, xy = rng.normal(0, 0.1, (grid.rows, grid.columns)), rng.uniform(0, 1, (50, 2)) * [160, 90]
     assert np.array_equal(field_scales(nodes, 160, 90), field_scales(nodes, 90, 160).T)
