@@ -1,6 +1,6 @@
 """Every setting, its default and its meaning, once; `read_config` reads and writes them."""
 
-from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
+from dataclasses import Field, dataclass, field, fields, is_dataclass
 from typing import Any
 
 STAGES = ("frames", "proxy", "tracking", "mapping", "global_ba", "export")
@@ -103,9 +103,6 @@ class RunConfig:
         0, "plan with this much memory: given, long recordings are made in parts that fit. 0 = half of the machine's",
         within=(100, 10_000_000), or_zero=True,
     )  # fmt: skip
-    cache_mb: int = setting(
-        2000, "results of networks are kept over runs, at most this many megabytes; 0 = none", within=(0, 1_000_000)
-    )
 
 
 @dataclass(frozen=True)
@@ -164,9 +161,6 @@ class FramesConfig:
     overlap: int = setting(
         8, "each keyframe is matched with this many after it (and a few further ones)", within=(1, 1000), draft=6
     )
-    loop_candidates: int = setting(
-        4, "each keyframe is also matched with this many that look alike, for loops", within=(0, 1000)
-    )
     masks: str = setting(
         "", "folder of masks, NAME.png for each image or some; black pixels are ignored",
         paths=("",),
@@ -183,10 +177,6 @@ class FramesConfig:
     still: str = setting(
         "auto", "auto leaves out what stands still in the image while the rest moves (a bonnet, a display, a frame "
         "around it); keep takes it for scene", ("auto", "keep"),
-    )  # fmt: skip
-    least_piece: int = setting(
-        8, "keyframes that cannot be placed among the others but among each other make a piece, from so many on",
-        within=(3, 1_000_000),
     )  # fmt: skip
     mapper: str = setting("auto", "structure from motion at once or view by view", ("auto", "global", "incremental"))
 
@@ -222,7 +212,6 @@ class ProxyConfig:
             "encoder.",
         ),
     )  # fmt: skip
-    frames: str = setting("keyframes", "which frames get maps; all needs depth without poses", ("keyframes", "all"))
     max_side: int = setting(
         640, "the maps are at most this many pixels on the long side", within=(64, 8192), draft=320, best=960
     )
@@ -238,23 +227,10 @@ class ProxyConfig:
             "poses: those of --poses are in metres.",
         ),
     )  # fmt: skip
-    fuse: str = setting(
-        "learned",
-        "which depth is fused with multi-view depth: a network's, and files no better than one; all; or none",
-        ("learned", "always", "never"),
-    )
     stereo_side: int = setting(
         640, "multiview matches images of this many pixels on the long side", within=(32, 4096), draft=320, best=960
     )
-    stereo_planes: int = setting(128, "multiview tries this many depths", within=(4, 1024), draft=64)
     moving: str = setting("auto", "auto leaves out what moved, by depth and poses; keep maps it", ("auto", "keep"))
-
-
-@dataclass(frozen=True)
-class TrackingConfig:
-    """Settings of camera tracking."""
-
-    use_depth: bool = setting(True, "tie triangulated points to metric proxy depths in the adjustment")
 
 
 @dataclass(frozen=True)
@@ -279,29 +255,23 @@ class MappingConfig:
             "Keep every N-th frame out of the map, to measure it there (evaluate). Default: 0, use all.",
         ),
     )  # fmt: skip
-    seed_stride: int = setting(2, "pixels between two new Gaussians where the map has a hole", within=(1, 64))
     passes: float = setting(
         9.0, "how often each keyframe is visited once all are seeded", within=(0, 1000), draft=6.0, best=14.0
     )
     min_iterations: int = setting(400, "at least this many such visits in all", within=(0, 10_000_000), draft=150)
-    snapshot_every: int = setting(150, "steps between two snapshots", within=(1, 1_000_000))
     max_gaussians: int = setting(1000000, "the map, or each submap, grows to this many", within=(100, 50_000_000))
     submap: int = setting(
         250, "more keyframes, or than run.memory_mb has room for, are mapped in overlapping parts of so many. 0: never",
         within=(4, 1_000_000), or_zero=True,
     )  # fmt: skip
     depth_weight: float = setting(4.8, "λ_D of eq. (18); 0 = no depth loss", within=(0, 1000))
-    use_proxy_depth: bool = setting(True, "false: the proxies only seed the map, no loss and no condition uses them")
     refine_poses: bool = setting(True, "refine keyframe poses together with the map")
-    exposure: bool = setting(True, "a gain and an offset a keyframe and colour")
 
 
 @dataclass(frozen=True)
 class GlobalBaConfig:
     """Loops and the global adjustment."""
 
-    use_loops: bool = setting(True, "look for places that are seen again")
-    joint: str = setting("moved", "refine map and poses together", ("moved", "always", "never"))
     posed: str = setting(
         "every", "every: the images of the source between the picked frames get a pose too; picked: those frames alone",
         ("every", "picked"),
@@ -335,13 +305,6 @@ class ExportConfig:
     voxel: float = setting(
         0.008, "voxel of the mesh, in units of the scene's median depth", within=(0.0005, 1), draft=0.014
     )
-    max_blocks: int = setting(
-        80000, "blocks of 8 x 8 x 8 voxels for 200 keyframes, more for more; voxels grow where that is too few",
-        within=(10, 10_000_000),
-    )  # fmt: skip
-    mesh_side: int = setting(
-        640, "pixels on the long side of their depth images", within=(16, 8192), draft=320, best=960
-    )
     planes: bool = setting(
         True, "the mesh's floors, walls and fronts straight: what no match confirms moves onto the planes beside it"
     )
@@ -367,38 +330,14 @@ class ExportConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """The complete settings of a run; one section a stage."""
+    """The complete settings of a run; a section for each stage that has some."""
 
     run: RunConfig = field(default_factory=RunConfig)
     frames: FramesConfig = field(default_factory=FramesConfig)
     proxy: ProxyConfig = field(default_factory=ProxyConfig)
-    tracking: TrackingConfig = field(default_factory=TrackingConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     global_ba: GlobalBaConfig = field(default_factory=GlobalBaConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
-
-
-PAPERS_PROXY: dict[str, Any] = {"frames": "all", "fuse": "never", "moving": "keep"}
-
-
-def with_method(config: Config) -> Config:
-    """Return the settings as `run.method` needs them: the paper gives every frame its own proxies, unmixed with what
-    structure from motion knows."""
-    return replace(config, proxy=replace(config.proxy, **PAPERS_PROXY)) if config.run.method == "paper" else config
-
-
-def without_method(config: Config) -> Config:
-    """Undo `with_method` in settings that are to be those of another method: what it gave is nobody's choice."""
-    usual = ProxyConfig()
-    given = {k: getattr(usual, k) for k, value in PAPERS_PROXY.items() if getattr(config.proxy, k) == value}
-    return replace(config, proxy=replace(config.proxy, **given))
-
-
-def overridden(config: Config) -> list[str]:
-    """Settings that were chosen and that `with_method` gives another value, as name=value."""
-    chosen = {k: getattr(config.proxy, k) for k in PAPERS_PROXY if config.run.method == "paper"}
-    usual = ProxyConfig()
-    return [f"proxy.{k}={v}" for k, v in chosen.items() if v not in (getattr(usual, k), PAPERS_PROXY[k])]
 
 
 def allowed_values(known: Field[Any]) -> str:

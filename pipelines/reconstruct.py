@@ -8,7 +8,7 @@ from ..formats.errors import InputError, RecoverableError
 from ..formats.gps import read_track
 from ..formats.reading import require_listable, require_unicode
 from ..formats.video import probe_video
-from .config import GPS_AUTO, GPS_OFF, SOURCE_LIST, STAGES, Config, overridden, with_method, without_method
+from .config import GPS_AUTO, GPS_OFF, SOURCE_LIST, STAGES, Config
 from .frames.inputs import check_frames, frames_division
 from .mapping.division import mapping_division
 from .proxy.inputs import check_proxy
@@ -115,26 +115,13 @@ def reconstruct(
         raise InputError(f"{source} is a run, no source: go on with it by `msgs-slam resume {quoted(source)}`")
     require_unicode(source.resolve())  # the manifest names it
     require_unicode(run.root.absolute())
-    config = _settled(config, run)
+    config = with_absolute_paths(config)
     digest = open_recording(source, config.run.format).digest
     _require_run_or_empty(run)
     require_device(config.run.device)  # refused before anything is written
     with locked(run):
         _require_same_source(run, source, digest, config.run.format)
         return _run(run, source.resolve(), digest, config, progress, until, workers, threads)
-
-
-def _settled(config: Config, run: RunFolder) -> Config:
-    """The settings as the method needs them; a chosen one that it does not use is warned of."""
-    was = existing_config(run)
-    if was is not None and was.run.method == "paper" != config.run.method:
-        config = without_method(config)
-    if lost := overridden(config):
-        log.warning(
-            f"--method paper gives every frame its own proxies as they are: {', '.join(lost)} is not used. Leave it "
-            "out, or use --method default"
-        )
-    return with_method(with_absolute_paths(config))
 
 
 def resume(
@@ -153,7 +140,7 @@ def resume(
         )
     origin = load_source(run)
     source = Path(origin.path)
-    config = _settled(config or load_settings(run), run)
+    config = with_absolute_paths(config or load_settings(run))
     require_device(config.run.device)
     with locked(run):
         return _run(run, source, origin.digest, config, progress, until, workers, redo=redo)

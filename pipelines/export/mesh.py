@@ -41,8 +41,8 @@ TRUNCATION = 3.0
 """Voxels on either side of a surface that a depth speaks for."""
 MIN_WEIGHT = 0.5
 """A voxel seen with less weight, in views at the median depth, has no surface."""
-LONG = 200
-"""Keyframes of a recording for which `export.max_blocks` is meant; a longer one may have more by its length."""
+MAX_BLOCKS, LONG = 80_000, 200
+"""Blocks of 8 x 8 x 8 voxels for so many keyframes, more for more; voxels grow where that is too few."""
 SURE = 0.5
 """Confidence of a proxy's depth from which the depth drawn there stays where it is."""
 _KEPT_BYTES = 100e6
@@ -103,7 +103,7 @@ def draw_keyframes(task: Chunk, progress: Progress) -> None:
 def draw(outcome: Outcome, settings: ExportConfig, scratch: Path, progress: Progress, numbers: range) -> None:
     """Render the map in the `keyframe_rows` with these numbers into `scratch`; existing files are kept."""
     rows, t, near = keyframe_rows(outcome), outcome.trajectory, maps_around(outcome)
-    camera = outcome.calibration.intrinsics.at_most(settings.mesh_side)
+    camera = outcome.calibration.intrinsics.at_most(outcome.config.mapping.max_side)
 
     def draw_one(number: int) -> None:
         if not (file := _view_file(scratch, number)).exists():
@@ -160,7 +160,7 @@ def _grid_around(views: Sequence[MeshView], settings: ExportConfig) -> Grid:
     step = 16 * -(-len(shown) // LONG)
     seen = np.concatenate([v.depth[v.trust > 0][::step] for v in shown])
     median = float(np.median(seen)) if len(seen) else 1.0
-    return make_grid(shown, settings.voxel * median, TRUNCATION, int(settings.max_blocks * max(len(views) / LONG, 1)))
+    return make_grid(shown, settings.voxel * median, TRUNCATION, int(MAX_BLOCKS * max(len(views) / LONG, 1)))
 
 
 def fuse_views(task: Chunk, progress: Progress) -> None:

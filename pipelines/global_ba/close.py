@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
-from ..config import TrackingConfig
 from ..geometry import se3
 from ..sfm.bundle import reprojection_errors
 from ..tracking.adjust import LoadProxy, Report, adjust_state
@@ -37,7 +36,7 @@ def adjust_with_loops(
     intrinsics: Intrinsics,
     load_proxy: LoadProxy,
     metric: bool,
-    tracking: TrackingConfig,
+    use_depth: bool,
 ) -> Closed:
     """Adjust `state` (changed in place) with the loops."""
     before = reprojection_error(state, intrinsics)
@@ -45,7 +44,7 @@ def adjust_with_loops(
     if drifted:
         distribute_drift(state, loops)
     add_sightings(state, loops)
-    report = adjust_state(state, intrinsics, load_proxy, metric, tracking)
+    report = adjust_state(state, intrinsics, load_proxy, metric, use_depth)
     after = reprojection_error(state, intrinsics, original)
     return Closed(state, report, before, after)
 

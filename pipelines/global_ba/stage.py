@@ -31,7 +31,7 @@ from ..sfm.bundle import reprojection_errors
 from ..sfm.features import GlobalDescriptors, compute_global_descriptors
 from ..system.parallel import LruSequence
 from ..system.values import load_value, save_value
-from ..tracking.adjust import align_depths, without_dependent_depth
+from ..tracking.adjust import align_depths, has_independent_depth
 from ..tracking.pictures import Pictures, load_shutter
 from ..tracking.state import TrackState, sparse_model_of
 from ..types import Array, Intrinsics, Trajectory
@@ -55,11 +55,10 @@ def run(context: StageContext) -> dict[str, Any]:
     model = context.run.load(SPARSE, "tracking")
     trajectory = context.run.load(TRAJECTORY, "mapping")
     fields = context.run.load(DEPTH_FIELDS, "tracking")
-    settings = context.config.global_ba
 
     # Loops of panoramas are those that structure from motion closes: the pose graph knows no places.
     is_rig = context.run.load(CALIBRATION).directions > 1
-    found = search(context, model) if settings.use_loops and not is_rig else FoundLoops([], 0, 0, 0)
+    found = FoundLoops([], 0, 0, 0) if is_rig else search(context, model)
     closed = apply_loops(context, model, found)
     gaussian_map: GaussianMap | None = None  # as mapping left it
     moved_px = 0.0
@@ -75,7 +74,7 @@ def run(context: StageContext) -> dict[str, Any]:
         fields = align_depths(model, closed.report, context.run.load(CALIBRATION).intrinsics, context.run.find_proxy)
     DEPTH_FIELDS.save(context.folder, fields)
     refined = None
-    if settings.joint == "always" or (settings.joint == "moved" and moved_px >= JOINT_PX):
+    if moved_px >= JOINT_PX:
         if gaussian_map is None:
             gaussian_map = context.run.load(MAP, "mapping").to(context.device)
         refined = refine_map(context, gaussian_map, trajectory, fields, JOINT_PASSES)
@@ -127,16 +126,16 @@ def apply_loops(context: StageContext, model: SparseModel, found: FoundLoops) ->
     """Everything adjusted with the loops; None without loops, or when they contradict what was known before."""
     if not found.loops:
         return None
-    run, config = context.run, context.config
+    run, _config = context.run, context.config
     intrinsics = run.load(CALIBRATION).intrinsics
     state = TrackState.from_backbone(model, FEATURE_SD, shutter=load_shutter(run))
     drift = max(loop_drift_px(loop, state, intrinsics) for loop in found.loops)
 
     report = run.load(FIGURES["proxy"])
     metric = bool(report.get("metric", False))
-    tracking = without_dependent_depth(config.tracking, report)
+    use_depth = has_independent_depth(report)
     drifted = drift > DRIFT_PX
-    closed = adjust_with_loops(state, found.loops, drifted, intrinsics, run.find_proxy, metric, tracking)
+    closed = adjust_with_loops(state, found.loops, drifted, intrinsics, run.find_proxy, metric, use_depth)
     if closed.error_after > 1.5 * closed.error_before + 0.05:
         context.warn(
             f"{len(found.loops)} loops were refused: with them the reprojection error of what was known before rises "

@@ -24,6 +24,8 @@ from .schedule import Seeding
 from .state import OptimiserState
 from .views import View
 
+SEED_STRIDE = 2
+"""Pixels between two new Gaussians where the map has a hole."""
 SEED_OPACITY = 0.73
 """Opacity (0..1) of a seed of an empty map."""
 SEED_RADIUS = 0.7
@@ -285,7 +287,7 @@ class Growth:
         """Of each view (H, W) uint8 distances in pixels to the next seed, 0 = no seed here; none in what is no part of
         the scene. Each is asked for twice as the map is seeded, and in every round of growth."""
         # Not a method: what is kept here would keep this, the views and the whole optimiser until garbage is collected.
-        views, stride = self.views, self.settings.seed_stride
+        views, stride = self.views, SEED_STRIDE
         return LruSequence(len(views), lambda i: _spacing(views[i], stride), lambda t: t.nbytes, SPACINGS_ROOM)
 
     def _holes(self, rendering: Rendering) -> Tensor:
@@ -294,10 +296,7 @@ class Growth:
 
     def _needed(self, view: View, rendering: Rendering) -> Tensor:
         """Conditions (a) and (b)."""
-        needed = self._holes(rendering)
-        if self.settings.use_proxy_depth:
-            needed = needed | hidden_surfaces(rendering.depth, view.depth, view.trust, DEPTH_TOLERANCE)
-        return needed
+        return self._holes(rendering) | hidden_surfaces(rendering.depth, view.depth, view.trust, DEPTH_TOLERANCE)
 
     def _grown_depth(self, view: View, rendering: Rendering) -> tuple[Tensor, Tensor]:
         """(H, W) depth and trust: the proxy where it is reliable, else the map's own; 0 where neither knows."""

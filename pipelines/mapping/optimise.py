@@ -25,6 +25,8 @@ from .views import View, half_view
 
 _FLOOR = 1 / (math.exp(SEED_LOGIT) - 1)
 """Added to every share of a class: one that has all votes gets the logit of a seed's own class, one without any 0."""
+SNAPSHOT_EVERY = 150
+"""Visits between two snapshots, at most."""
 _MIN_VOTES = 1e-6
 """Pixels: who has less of all views keeps the classes that he has."""
 
@@ -64,7 +66,7 @@ def optimise_map(
     schedule = Schedule.plan(views, settings, seed, seeding, passes, first_rate)
     optimiser = MapOptimiser(views, classes, settings, state)
     # A map and its visits grow together: were it written every so many visits, all of it would be written ever longer.
-    every = max(settings.snapshot_every, len(views))
+    every = max(min(SNAPSHOT_EVERY, schedule.total // 4), len(views))
     remaining = range(state.iteration, schedule.total)
     for iteration in (progress or SilentProgress()).track(remaining, label, len(remaining)):
         optimiser.step(schedule.step(iteration))
@@ -126,8 +128,7 @@ class MapOptimiser:
         refines = self.settings.refine_poses and step.refine_pose
         stats = GaussianStats(view.scene) if step.note else None
         rendering = self.draw(view, pose.requires_grad_(refines), values, stats)
-        if self.settings.exposure:
-            self._expose(step.view, view, rendering)
+        self._expose(step.view, view, rendering)
         if stats is not None:
             stats.errors = self._color_errors(step.view, view, rendering.features)
         exposure = self.state.exposures[step.view]

@@ -87,6 +87,6 @@ PAPER = Constants()
 def constants_of(config: Config) -> Constants:
     """Take the paper's constants, with κ of the settings and without what these switch off: the depth terms."""
     chosen = replace(PAPER, kappa=config.run.kappa)
-    if config.mapping.use_proxy_depth and config.mapping.depth_weight > 0:
+    if config.mapping.depth_weight > 0:
         return chosen
     return replace(chosen, track_depth=0.0, map_depth=0.0)

@@ -216,8 +216,6 @@ def _loops(
     context: StageContext, recording: FrameViews, trajectory: Trajectory, fields: DepthFields, gaussian_map: GaussianMap
 ) -> tuple[int, list[LoopEdge]]:
     """Return how many candidates there are, and the loops among them; kept in a snapshot."""
-    if not context.config.global_ba.use_loops:
-        return 0, []
     kept = LOOPS.find(context.snapshot)
     ids = trajectory.frame_ids[trajectory.is_keyframe].tolist()
     classes = len(context.run.load(CLASSES))

@@ -33,6 +33,10 @@ LEARNED_SPREAD = 0.02
 """Files whose depths stray by more from the triangulated points, relatively and within one frame, are taken for a
 network's. Measured: true depth 0.004, two models of a network 0.056 and 0.059."""
 _FILES_LOOKED_AT = 12
+STEREO_PLANES, _PIXELS_A_PLANE = 128, 5
+"""Depths that multiview tries: at most so many, and fewer in small images, where more lie within a pixel."""
+CACHE_MB = 2000
+"""Megabytes of results of networks that are kept over runs."""
 AUTO = ("auto", "best")
 """Words that leave it to the networks in the cache: the first of the table, or the largest."""
 
@@ -40,8 +44,8 @@ AUTO = ("auto", "best")
 @dataclass(frozen=True)
 class ProviderContext:
     """Inputs of every provider. `scratch(name)` is a folder that exists as long as the stage is unfinished; `recording`
-    is the source's data set, None for a video or plain images; results of networks are kept over runs in `cache_mb`
-    megabytes. People are left out of a frame, so that no place is one, where `no_people`."""
+    is the source's data set, None for a video or plain images; people are left out of a frame, so that no place is one,
+    where `no_people`; with `may_fuse` False depth is what its provider says, never fused with multi-view depth."""
 
     source: Path
     sequence: Sequence
@@ -51,8 +55,8 @@ class ProviderContext:
     device: str
     progress: Progress
     recording: Recording | None = None
-    cache_mb: int = 0
     no_people: bool = False
+    may_fuse: bool = True
 
 
 def split_choice(text: str, setting: str, kinds: tuple[str, ...]) -> tuple[str, str]:
@@ -128,8 +132,8 @@ def open_depth(around: ProviderContext) -> DepthProvider:
 
 def _wants_fusion(around: ProviderContext, choice: Choice, learned: DepthProvider) -> bool:
     """Whether the depth gains from multi-view depth: a network's does."""
-    if around.config.fuse != "learned" or choice.card is not None:
-        return around.config.fuse != "never"
+    if choice.card is not None or not around.may_fuse:
+        return around.may_fuse
     from ..depth.fused import measure_scale
 
     posed = [f for f in around.sequence.frames if f.id in around.sequence.cam_from_world]
@@ -217,7 +221,8 @@ def _cached(task: str, largest: bool) -> Card | None:
 def _multiview(around: ProviderContext) -> MultiviewDepth:
     from ..depth.stereo.provider import MultiviewDepth
 
-    side, planes = around.config.stereo_side, around.config.stereo_planes
+    side = around.config.stereo_side
+    planes = min(STEREO_PLANES, side // _PIXELS_A_PLANE)
     return MultiviewDepth(
         around.sequence, side, planes, lambda: around.scratch("stereo"), around.threads, around.progress, around.device
     )
@@ -244,7 +249,7 @@ def _fused(around: ProviderContext, learned: DepthProvider) -> DepthProvider:
 
 
 def _workplace(around: ProviderContext, scratch: str) -> Workplace:
-    cache = ResultCache(default_cache() / "results", around.cache_mb)
+    cache = ResultCache(default_cache() / "results", CACHE_MB)
     return Workplace(
         around.sequence, lambda: around.scratch(scratch), around.threads, around.device, around.progress, cache
     )

@@ -61,11 +61,11 @@ class ProxyStage:
         return figures
 
     def _frames_to_do(self) -> list[Frame]:
-        sequence, wanted = self.work.sequence, self.context.config.proxy.frames
-        if (wanted == "all" and self.work.depths.metric) or sequence.backbone is None:
+        sequence, is_paper = self.work.sequence, self.context.config.run.method == "paper"
+        if (is_paper and self.work.depths.metric) or sequence.backbone is None:
             return sequence.frames
-        if wanted == "all":
-            self.warn(f"proxy.frames=all: {self.work.depths.name} knows only keyframes, the other frames get no maps")
+        if is_paper:
+            self.warn(f"--method paper: {self.work.depths.name} knows only keyframes, the other frames get no maps")
         return self.work.posed(sequence.frames)
 
     def _warn_of_missing(self) -> None:
@@ -147,7 +147,8 @@ class ProxyStage:
 
     def _leave_out_moving(self, scale: DepthScale) -> dict[str, float | int]:
         """Store masks of what moved; return in how many frames, and how much of those."""
-        if self.context.config.proxy.moving != "auto":
+        config = self.context.config
+        if config.proxy.moving != "auto" or config.run.method == "paper":
             return {}
         posed = self.work.posed(self.frames)
         seen = in_frames(self.work, find_moving_in, posed, scale=scale)

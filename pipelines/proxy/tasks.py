@@ -60,7 +60,7 @@ class ProxyWork:
         recording = open_recording(context.source, config.run.format).dataset()
         return ProviderContext(
             context.source, self.sequence, config.proxy, lambda name: context.snapshot / name, context.threads,
-            context.device, context.progress, recording, config.run.cache_mb, config.frames.people != "keep",
+            context.device, context.progress, recording, config.frames.people != "keep", config.run.method != "paper",
         )  # fmt: skip
 
     def posed(self, frames: list[Frame]) -> list[Frame]:

@@ -38,6 +38,9 @@ from .rolling import NO_READOUT, Readout, RollingModel, adjust_rolling, read_rea
 from .snapshots import features_name, pairs_name
 from .two_views import require_parallax, why_no_structure
 
+LEAST_PIECE, LOOP_CANDIDATES = 8, 4
+"""Keyframes from which those that can be placed among each other alone make a piece; and how many that look alike each
+keyframe is also matched with."""
 _PAIRS_PER_BLOCK = 64
 _FEATURES_SHARE = 0.25
 """Of the memory that there is: what has no room there is read again from the snapshot."""
@@ -142,7 +145,7 @@ class StructureFromMotion(CandidateModels):
         bundle, _, pinhole = rolling.bundle()
         number = {i - 1: n for n, i in enumerate(rolling.images)}
         components = [[number[k] for k in component] for component in report.components]
-        loose, _ = undetermined_cameras(bundle, pinhole, components, self.config.least_piece, range(len(number)))
+        loose, _ = undetermined_cameras(bundle, pinhole, components, LEAST_PIECE, range(len(number)))
         return [rolling.images[n] - 1 for n in loose]
 
     def _as_given(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> AdjustedModel | None:
@@ -184,7 +187,7 @@ class StructureFromMotion(CandidateModels):
         release_free_memory()
         together = partial(adjust_joined, pairs=pairs, windows=windows, narrowly=bool(views.weak))
         readout = together(whole.model, views.xy, views.times, readout, find_readout=given is None)
-        others = made.others(camera, views.xy, whole.model, self.config.least_piece)
+        others = made.others(camera, views.xy, whole.model, LEAST_PIECE)
         for other in others:
             together(other, views.xy, views.times, readout)
         return replace(whole, readout=readout), others
@@ -245,7 +248,7 @@ class StructureFromMotion(CandidateModels):
         pieces: list[pycolmap.Reconstruction] = []
         for number in numbers:
             rest = [p for p in pairs if p.first in left and p.second in left]
-            if len({k for p in rest for k in (p.first, p.second)}) < self.config.least_piece:
+            if len({k for p in rest for k in (p.first, p.second)}) < LEAST_PIECE:
                 return pieces
             snapshots = self.snapshots.inside(f"piece_{number}")
             of_piece = replace(self, camera=camera, is_fixed=True, snapshots=snapshots)
@@ -253,7 +256,7 @@ class StructureFromMotion(CandidateModels):
             if tried[0] is None or not self._is_piece(tried[0][2]):
                 tried.append(of_piece._map(views, rest, ("incremental",)))
             found = max(filter(None, tried), key=lambda f: (self._is_piece(f[2]), f[2].registered), default=None)
-            if found is None or found[2].registered < self.config.least_piece:
+            if found is None or found[2].registered < LEAST_PIECE:
                 return pieces
             piece = found[0]
             adjust_model(piece, refine_camera=False)
@@ -265,7 +268,7 @@ class StructureFromMotion(CandidateModels):
         return pieces
 
     def _is_piece(self, report: ModelReport) -> bool:
-        return len(report.largest) >= self.config.least_piece and report.is_consistent
+        return len(report.largest) >= LEAST_PIECE and report.is_consistent
 
     def _largest_first(
         self, found: AdjustedModel, pieces: list[pycolmap.Reconstruction], views: KeyframeSet
@@ -309,7 +312,7 @@ class StructureFromMotion(CandidateModels):
     def _proposed(self, features: LruSequence[Features], vocabulary: Vocabulary) -> list[tuple[int, int]]:
         descriptors, places = compute_global_descriptors(features, len(features), vocabulary), self._places(features)
         allowed = far_apart(len(features), self.config.overlap + 1, places)
-        loops = loop_pairs(GlobalDescriptors((descriptors,)), allowed, self.config.loop_candidates)
+        loops = loop_pairs(GlobalDescriptors((descriptors,)), allowed, LOOP_CANDIDATES)
         following = sequential_pairs(places, self.config.overlap)
         firsts = range(0, len(features), places)
         return sorted({*((n + i, n + j) for n in firsts for i, j in following), *loops})

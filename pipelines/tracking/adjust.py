@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import TrackingConfig
 from ..depth import align as scales
 from ..depth.align import COARSE, WorldScale, align_keyframes
 from ..depth.fields import DepthFields
@@ -61,14 +60,13 @@ class Report:
     bundle: Bundle
 
 
-def without_dependent_depth(settings: TrackingConfig, proxy_report: Mapping[str, Any]) -> TrackingConfig:
-    """Return the settings, `use_depth` off where the proxies were made from the same images."""
-    independent = proxy_report.get("independent_depth", proxy_report.get("metric", False))
-    return settings if independent else replace(settings, use_depth=False)
+def has_independent_depth(proxy_report: Mapping[str, Any]) -> bool:
+    """Return whether depth adds to the poses: proxies made from the same images say nothing new about them."""
+    return bool(proxy_report.get("independent_depth", proxy_report.get("metric", False)))
 
 
 def adjust_state(
-    state: TrackState, intrinsics: Intrinsics, load_proxy: LoadProxy, metric: bool, settings: TrackingConfig
+    state: TrackState, intrinsics: Intrinsics, load_proxy: LoadProxy, metric: bool, use_depth: bool
 ) -> Report:
     """Adjust `state` in place: rounds of scale fields, removal of outliers and bundle adjustment.
 
@@ -85,7 +83,7 @@ def adjust_state(
         keep = consistent(bundle, intrinsics, bundle.obs_source >= (0 if round_number == 0 else -1))
         bundle, in_frame = bundle.select(keep), in_frame[keep]
         ties.depth, ties.reliability = ties.depth[keep], ties.reliability[keep]
-        tied = with_depths(bundle, ties, intrinsics, settings)
+        tied = with_depths(bundle, ties, intrinsics, use_depth)
         result = adjust_bundle(tied, intrinsics, ITERATIONS, ids=np.array(frame_ids), rig=state.rig)
         initial = result.initial_cost if initial is None else initial
         bundle = result.bundle
@@ -104,7 +102,7 @@ def adjust_state(
         "cost_before": initial,
         "cost_after": result.cost,
     }
-    return Report(figures, frame_ids, ties, with_depths(bundle, ties, intrinsics, settings))
+    return Report(figures, frame_ids, ties, with_depths(bundle, ties, intrinsics, use_depth))
 
 
 def drop_loose(
@@ -210,13 +208,13 @@ def set_scale(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics) -> Bundle
     return replace(bundle, cam_from_world=se3.scaled(bundle.cam_from_world, factor), points=bundle.points * factor)
 
 
-def with_depths(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics, settings: TrackingConfig) -> Bundle:
+def with_depths(bundle: Bundle, ties: DepthTies, intrinsics: Intrinsics, use_depth: bool) -> Bundle:
     """Return the bundle with the rescaled proxy depths as its depth observations.
 
     Proxies that were made from the same images say nothing new about the poses: without metres, or with
     `use_depth` off, they are left out.
     """
-    if not (settings.use_depth and ties.metric):
+    if not (use_depth and ties.metric):
         return bundle
     log_scale = COARSE.at(bundle.obs_xy, intrinsics.width, intrinsics.height).of(ties.fields[bundle.obs_cam])
     trusted = (ties.depth > 0) & ties.has_depth[bundle.obs_cam]

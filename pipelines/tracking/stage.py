@@ -20,12 +20,13 @@ from ..run.files import (
 )
 from ..run.stages import StageContext
 from ..sfm.adjust import FEATURE_SD
+from ..sfm.driver import LEAST_PIECE
 from ..system.machine import release_free_memory
 from ..system.progress import is_asked
 from ..system.values import load_value, save_value
 from ..system.wording import stretches
 from ..types import Frame
-from .adjust import Report, adjust_state, align_depths, drop_loose, without_dependent_depth
+from .adjust import Report, adjust_state, align_depths, drop_loose, has_independent_depth
 from .front_end import FrontEnd, set_rotation_only_poses
 from .pictures import Pictures, load_shutter
 from .pnp import MAX_GAP
@@ -62,18 +63,17 @@ class TrackingStage:
 
     def run(self) -> dict[str, Any]:
         """Do the stage; its key figures."""
-        pictures, seed, least_piece = self.pictures, self.config.run.seed, self.config.frames.least_piece
+        pictures, seed = self.pictures, self.config.run.seed
         state = self._track_frames()
         self._require_poses(state, 2 if self.context.run.find(GIVEN_POSES) is None else 1)
-        settings = without_dependent_depth(self.config.tracking, self.proxy)
-        report = adjust_state(state, pictures.intrinsics, pictures.proxy, self.is_metric, settings)
+        report = adjust_state(state, pictures.intrinsics, pictures.proxy, self.is_metric, has_independent_depth(self.proxy))
         release_free_memory()
-        _, apart = drop_loose(state, report, pictures.intrinsics, least_piece)
+        _, apart = drop_loose(state, report, pictures.intrinsics, LEAST_PIECE)
         carried = carry_given(self.context, state, apart)
         self._require_poses(state, 2)
         set_rotation_only_poses(state, pictures, seed)
         self._warn_of_turned(state)
-        state, *pieces = split_worlds(state, least_piece)
+        state, *pieces = split_worlds(state, LEAST_PIECE)
         self._save_pieces(pieces)
         self._save(state, report)
         figures = {**self._figures(state, report), **carried, "pieces": [len(p.poses) for p in pieces]}

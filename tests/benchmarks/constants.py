@@ -28,6 +28,7 @@ from shape import gather, make_view, measure, true_depths
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.providers import Sequence
 from msgs_slam.pipelines.proxy.maps import reliability
+from msgs_slam.pipelines.proxy.selection import STEREO_PLANES
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -112,7 +113,7 @@ def measure_depth(folder: Path, truth: Path, matches: Path) -> dict[str, float]:
     calibration = run.load(CALIBRATION)
     camera = calibration.intrinsics.at_most(config.max_side)
     sequence = Sequence(run.load(FRAMES), calibration, camera, run.load(BACKBONE), run.image)
-    stereo = MultiviewDepth(sequence, config.stereo_side, config.stereo_planes, lambda: matches, 1, SilentProgress())
+    stereo = MultiviewDepth(sequence, config.stereo_side, STEREO_PLANES, lambda: matches, 1, SilentProgress())
     stereo.precompute(sequence.frames)
     truths, views = true_depths(run, truth), []
     for frame in sequence.frames:

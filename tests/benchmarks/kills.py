@@ -44,13 +44,13 @@ from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.world import ClipOptions, iter_clip, make_world
 
 SETTINGS = (
-    "run.threads=1", "run.device=cpu", "frames.max_features=600", "proxy.stereo_side=64", "proxy.stereo_planes=16",
+    "run.threads=1", "run.device=cpu", "frames.max_features=600", "proxy.stereo_side=64",
     "mapping.passes=1",
-    "mapping.min_iterations=20", "mapping.max_gaussians=3000", "mapping.snapshot_every=5", "export.voxel=0.1",
+    "mapping.min_iterations=20", "mapping.max_gaussians=3000", "export.voxel=0.1",
 )  # fmt: skip
 CHANGES = (
-    (), ("export.axes=first",), ("proxy.stereo_planes=12",), ("mapping.min_iterations=24",), ("export.mesh_side=100",),
-    ("global_ba.use_loops=false",), ("tracking.use_depth=false",), ("frames.max_features=500",),
+    (), ("export.axes=first",), ("proxy.stereo_side=60",), ("mapping.min_iterations=24",), ("export.voxel=0.08",),
+    ("global_ba.posed=picked",), ("mapping.refine_poses=false",), ("frames.max_features=500",),
 )  # fmt: skip
 """Settings of one round after the other, each beside SETTINGS: rounds begin at different stages."""
 CALLS = ("replace", "fsync", "unlink", "rmdir", "mkdir", "open")

@@ -63,8 +63,6 @@ CASES = {
 
 ABLATIONS = {
     **ARTICLE_ABLATIONS,
-    "without exposure": ("mapping.exposure=false",),
-    "without pose refinement": ("mapping.refine_poses=false",),
 }
 
 

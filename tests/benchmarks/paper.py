@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.formats.textfile import read_json_object, write_json
-from msgs_slam.pipelines.config import Config, with_method
+from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.paper import constants as paper_constants
@@ -62,9 +62,9 @@ _NO_DEPTH = {"track_depth": 0.0, "map_depth": 0.0}
 _NO_CLASSES = {"track_semantic": 0.0, "map_semantic": 0.0, "map_edge": 0.0}
 ABLATIONS: dict[str, tuple[dict[str, float], tuple[str, ...]]] = {
     "all": ({}, ()),
-    "without proxy depth (table 7)": (_NO_DEPTH, ("mapping.use_proxy_depth=false",)),
+    "without proxy depth (table 7)": (_NO_DEPTH, ("mapping.depth_weight=0.0",)),
     "without semantic loss (table 8)": (_NO_CLASSES, ()),
-    "without semantic loops (table 9)": ({}, ("global_ba.use_loops=false",)),
+    "without semantic loops (table 9)": ({"t_loop": np.inf}, ()),
     "colour alone (table 10)": (_NO_DEPTH | _NO_CLASSES, ()),
 }  # fmt: skip
 """Name → constants of the paper that change, and settings of both methods. A term that a method lacks has no row."""
@@ -188,7 +188,7 @@ def ablations(given: argparse.Namespace, truth: Sequence, methods: dict[str, str
             runs = []
             for seed in seeds:
                 overrides = [*known, *settings, f"run.method={method}", f"run.seed={seed}"]
-                config = with_method(load_config(None, overrides))
+                config = load_config(None, overrides)
                 slug = "".join(c if c.isalnum() else "_" for c in f"{method}_{name}_{given.ablation_frames}_{seed}")
                 run = RunFolder(given.work / f"{slug}.msgs")
                 branch(base, run, ("frames", "proxy"), (all_stages(method), config))

@@ -57,7 +57,7 @@ APART, BESIDE = 0.3, 0.1
 """Metres from every true surface at which something is none of it, and from another point to be the same. Of the solid
 Gaussians of a clean map of 24 frames 614 are farther than 10 cm from every true surface, 59 than 15, 10 than 20, 0 than
 30: far walls without parallax."""
-COARSE = ["proxy.stereo_side=160", "proxy.stereo_planes=16", "proxy.max_side=160"]
+COARSE = ["proxy.stereo_side=160", "proxy.max_side=160"]
 
 
 @dataclass(frozen=True)

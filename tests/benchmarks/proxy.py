@@ -36,6 +36,7 @@ from tracking import write_noisy_depth
 from msgs_slam.formats.image_folder import natural_key
 from msgs_slam.formats.images import read_depth_png
 from msgs_slam.pipelines.geometry.camera import project, resample_nearest, unproject_depth
+from msgs_slam.pipelines.proxy import selection
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, CLASSES, FIGURES, FRAMES, PROXY_MAPS
@@ -321,8 +322,9 @@ def measure_fused(name: str, work: Path, first: int) -> Iterator[tuple[str, dict
     if not run.root.exists():
         shutil.copytree(run_of(name, work, first).root, run.root)
     write_noisy_depth(CASES[name].depth, noisy)
-    for provider, fuse in (("network", "never"), ("network + multiview", "always")):
-        run_proxy(pictures_of(name, work, first), run, f'proxy.depth="files:{noisy}"', f"proxy.fuse={fuse}")
+    for provider, spread in (("network", np.inf), ("network + multiview", -1.0)):
+        selection.LEARNED_SPREAD = spread
+        run_proxy(pictures_of(name, work, first), run, f'proxy.depth="files:{noisy}"')
         yield provider, measure_depth(CASES[name], run)
 
 

@@ -2,7 +2,7 @@
 
     python tests/benchmarks/tracking.py                              all sequences, the table
     python tests/benchmarks/tracking.py kitchen whiteroom_files      some of them
-    python tests/benchmarks/tracking.py --set tracking.use_depth=false --json rows.json
+    python tests/benchmarks/tracking.py --set frames.overlap=4 --json rows.json
     python tests/benchmarks/tracking.py --colmap                     pycolmap's mappers too, self-calibrated
     python tests/benchmarks/tracking.py --until global_ba            loops and the joint refinement as well
     python tests/benchmarks/tracking.py --lengths 250 500 1000       a walk of that many frames in the made-up room
@@ -55,7 +55,7 @@ WALKS: dict[str, dict[str, Any]] = {
     },
 }
 """Layouts of the made-up world, and how a camera walks through each."""
-COARSE = ("proxy.stereo_side=160", "proxy.stereo_planes=32")
+COARSE = ("proxy.stereo_side=160",)
 """Quick proxies where only poses are judged: multi-view depth takes no part in them."""
 Truth = Callable[[str, int], NDArray[np.float64] | None]
 """(name in the source, index in the source) -> world_from_cam (4, 4), None where it is not known."""

@@ -10,9 +10,9 @@ from msgs_slam.msgs_cli.main import main
 from tests.world import ClipOptions
 
 QUICK = (
-    "run.threads=1", "run.device=cpu", "frames.max_features=600", "proxy.stereo_side=96", "proxy.stereo_planes=24",
+    "run.threads=1", "run.device=cpu", "frames.max_features=600", "proxy.stereo_side=96",
     "mapping.passes=1",
-    "mapping.min_iterations=20", "mapping.max_gaussians=8000", "mapping.snapshot_every=5", "export.voxel=0.05",
+    "mapping.min_iterations=20", "mapping.max_gaussians=8000", "export.voxel=0.05",
 )  # fmt: skip
 OPTIONS = ClipOptions(frames=14, width=160, height=120, fps=10.0, laps=0.26)
 

@@ -24,7 +24,7 @@ from tests.world import iter_clip, make_world
 
 CLIP = replace(OPTIONS, frames=14, laps=0.24)
 FIRST, SECOND, THIRD = slice(0, 8), slice(6, 14), slice(10, 14)
-SETTINGS = [x for s in (*QUICK, "mapping.max_gaussians=30000", "mapping.seed_stride=4") for x in ("--set", s)]
+SETTINGS = [x for s in (*QUICK, "mapping.max_gaussians=30000") for x in ("--set", s)]
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from msgs_slam.pipelines.config import EXPORTS, STAGES
 PROGRAM = Path(sys.executable).with_name("msgs-slam")
 PACKAGE = Path(importlib.import_module("msgs_slam.pipelines").__file__ or "").parents[1]
 SMALL = (
-    "run.device=cpu", "frames.max_features=600", "frames.rate=5", "proxy.stereo_side=96", "proxy.stereo_planes=24",
+    "run.device=cpu", "frames.max_features=600", "frames.rate=5", "proxy.stereo_side=96",
     "mapping.passes=1", "mapping.min_iterations=20", "mapping.max_gaussians=8000", "export.voxel=0.05",
 )  # fmt: skip
 FILES = {

@@ -23,7 +23,7 @@ def begin(video: Path, out: Path, device: str, settings: tuple[str, ...] = ()) -
     command = [sys.executable, "-m", "msgs_slam", "reconstruct", str(video), "--out", str(out), "--device", device]
     with out.with_suffix(".log").open("w") as log:
         return subprocess.Popen(
-            [*command, "--set", "run.cache_mb=0", *settings, "-q"], stdout=log, stderr=log, text=True
+            [*command, *settings, "-q"], stdout=log, stderr=log, text=True
         )  # fmt: skip
 
 

@@ -126,9 +126,9 @@ def test_views_of_a_run_are_made_straight_once(oracle_run: OracleRun, tmp_path: 
     run = oracle_run(video=True)
     outcome = load_outcome(run)
     count = len(keyframe_rows(outcome))
-    draw(outcome, ExportConfig(mesh_side=80, planes=False), tmp_path / "off", SilentProgress(), range(count))
+    draw(outcome, ExportConfig(planes=False), tmp_path / "off", SilentProgress(), range(count))
     assert mesh_views(tmp_path / "off", count)[0].unsure is None
-    draw(outcome, ExportConfig(mesh_side=80), tmp_path, SilentProgress(), range(count))
+    draw(outcome, ExportConfig(), tmp_path, SilentProgress(), range(count))
     assert mesh_views(tmp_path, count)[0].unsure is not None
     planes = planes_in(tmp_path, count)
     snap(tmp_path, planes, SilentProgress(), range(count))

@@ -134,7 +134,7 @@ def test_texture_shows_the_photographs(run: RunFolder, folder: Path, exported: O
 
 
 def test_one_kind_of_mesh_and_colours_without_a_texture(run: RunFolder, tmp_path: Path) -> None:
-    few = replace(SETTINGS, texture=False, mesh_side=160)
+    few = replace(SETTINGS, texture=False)
     names = [path.name for path in export_run(run, tmp_path, "mesh", settings=few)]
     assert names == ["mesh.ply", "mesh.glb", "world.json", "README.txt"]
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted([LIST, *names])

@@ -2,6 +2,7 @@
 
 import hashlib
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +23,19 @@ from tests.pipelines.frames.conftest import WALK_FRAMES, render, sideways, write
 
 APART = 9
 SETTINGS = (
-    "run.threads=1", "run.device=cpu", "frames.max_features=500", "frames.overlap=5", "frames.loop_candidates=2",
-    "frames.least_piece=5", "proxy.stereo_side=96", "proxy.stereo_planes=24", "proxy.depth=multiview",
+    "run.threads=1", "run.device=cpu", "frames.max_features=500", "frames.overlap=5",
+    "proxy.stereo_side=96", "proxy.depth=multiview",
     "proxy.semantics=segments", "mapping.passes=1", "mapping.min_iterations=10", "mapping.max_side=96",
     "mapping.max_gaussians=4000", "export.voxel=0.05", "export.scale=free",
 )  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_pieces() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("msgs_slam.pipelines.sfm.driver.LEAST_PIECE", 5)
+        patch.setattr("msgs_slam.pipelines.tracking.stage.LEAST_PIECE", 5)
+        yield
 
 
 def invoke(*arguments: object) -> str:

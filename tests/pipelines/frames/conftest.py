@@ -19,7 +19,7 @@ from msgs_slam.pipelines.system.progress import SilentProgress
 WIDTH, HEIGHT = 320, 240
 FOCAL = 280.0
 WALK_FRAMES = 12
-QUICK = ("run.threads=2", "frames.max_features=500", "frames.overlap=5", "frames.loop_candidates=2")
+QUICK = ("run.threads=2", "frames.max_features=500", "frames.overlap=5")
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.config import TrackingConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import align_points
@@ -163,7 +162,7 @@ def test_tracked_frames_are_adjusted_with_the_readout(together: bool, monkeypatc
             mine = bundle.obs_cam == k
             seen = Sightings.of(bundle.obs_point[mine], bundle.obs_xy[mine], 0.5)
             state.add_frame(k, pose, seen, is_keyframe=k % 2 == 0, segment=0)
-        adjust_state(state, CAMERA, lambda _: None, False, TrackingConfig())
+        adjust_state(state, CAMERA, lambda _: None, False, True)
         errors.append(off_by(np.array([state.poses[i] for i in range(COUNT)])))
     assert 0 < errors[1] < 0.3 * errors[0]
 

@@ -285,14 +285,15 @@ def test_an_unreadable_image_is_left_out_with_a_warning(
 
 
 def test_what_shows_another_place_is_a_piece_of_its_own(
-    tmp_path: Path, make_context: Callable[..., StageContext]
+    tmp_path: Path, make_context: Callable[..., StageContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A walk, cut to the walk through the mirrored room, of which no picture fits the others."""
+    monkeypatch.setattr("msgs_slam.pipelines.sfm.driver.LEAST_PIECE", 5)
     folder = tmp_path / "both"
     walk = write_walk(folder, sideways(WALK_FRAMES))
     for i, (center, rotation) in enumerate(sideways(8)):
         write_rgb(folder / f"view_{WALK_FRAMES + i:03d}.png", np.ascontiguousarray(render(center, rotation)[:, ::-1]))
-    context = make_context(folder, "frames.least_piece=5")
+    context = make_context(folder)
     run(context)
     context.folder.rename(context.run.stage("frames"))
     backbone, pieces = context.run.find(BACKBONE), context.run.pieces("frames")

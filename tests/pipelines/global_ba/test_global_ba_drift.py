@@ -113,7 +113,8 @@ def close(
     def run(joint: str) -> tuple[RunFolder, dict]:
         made = make_run(tmp_path / joint, keyframes=tuple(range(0, 24, 2)), backbone_scale=1.0, metric=False)
         finish_mapping(made, room_frames[1])
-        context = open_stage(made.run, "global_ba", load_config(overrides=[*SETTINGS, f"global_ba.joint={joint}"]))
+        monkeypatch.setattr("msgs_slam.pipelines.global_ba.stage.JOINT_PX", 0.0 if joint == "always" else np.inf)
+        context = open_stage(made.run, "global_ba", load_config(overrides=SETTINGS))
         figures = run_global_ba(context)
         shutil.rmtree(context.folder / "snapshot", ignore_errors=True)
         context.folder.rename(made.run.stage("global_ba"))

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.config import TrackingConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import align_points
@@ -164,7 +163,7 @@ def test_closing_takes_the_drift_away(drift: float, growth: float) -> None:
     assert len(found.loops) >= 3
     state = TrackState.from_backbone(walk.model, 0.5)
     before = error(walk.model.cam_from_world, walk.truth)
-    closed = adjust_with_loops(state, found.loops, drift != 0, CAMERA, lambda _: None, False, TrackingConfig())
+    closed = adjust_with_loops(state, found.loops, drift != 0, CAMERA, lambda _: None, False, True)
     after = error(np.array([state.poses[k] for k in range(40)]), walk.truth)
     assert 0 < after < 0.004
     assert drift == 0 or before > 0.015

@@ -17,6 +17,7 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import unproject
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
+from msgs_slam.pipelines.global_ba.loops import FoundLoops
 from msgs_slam.pipelines.global_ba.stage import run as run_global_ba
 from msgs_slam.pipelines.mapping.views import occurring_classes
 from msgs_slam.pipelines.read_config import load_config
@@ -149,8 +150,8 @@ def test_a_loop_is_closed_and_the_map_goes_along(
     monkeypatch.setattr("msgs_slam.pipelines.global_ba.loops.MIN_ALIKE", -1.0)
     made = mapped("run")
     before = error(made.run.load(TRAJECTORY, "mapping").cam_from_world, made.cam_from_world)
-    config = load_config(overrides=["global_ba.joint=never"])
-    figures = finish(open_stage(made.run, "global_ba", config))
+    monkeypatch.setattr("msgs_slam.pipelines.global_ba.stage.JOINT_PX", np.inf)
+    figures = finish(open_stage(made.run, "global_ba", load_config()))
     assert figures["loops"] >= 1
     assert figures["moved_px"] > 0.5
     after = made.run.load(TRAJECTORY, "global_ba")
@@ -164,10 +165,12 @@ def test_a_loop_is_closed_and_the_map_goes_along(
     assert torch.equal(old.colors, new.colors)
 
 
-def test_without_loops_nothing_moves(mapped: Callable[[str], MadeRun], open_stage: Callable[..., StageContext]) -> None:
+def test_without_loops_nothing_moves(
+    mapped: Callable[[str], MadeRun], open_stage: Callable[..., StageContext], monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = mapped("run")
-    config = load_config(overrides=["global_ba.use_loops=false", "global_ba.joint=moved"])
-    figures = finish(open_stage(made.run, "global_ba", config))
+    monkeypatch.setattr("msgs_slam.pipelines.global_ba.stage.search", lambda *_: FoundLoops([], 0, 0, 0))
+    figures = finish(open_stage(made.run, "global_ba", load_config()))
     assert figures["loops"] == 0
     assert figures["joint"] == "not run"
     for name in ("trajectory.npz", "map.safetensors"):
@@ -179,9 +182,9 @@ def test_joint_refinement_is_kept_only_where_it_helps_and_survives_interruption(
 ) -> None:
     monkeypatch.setattr("msgs_slam.pipelines.global_ba.stage.JOINT_PASSES", 2.0)
     whole, broken = mapped("a"), mapped("b")
-    config: Config = load_config(
-        overrides=["mapping.max_side=128", "mapping.snapshot_every=4", "global_ba.joint=always"]
-    )
+    monkeypatch.setattr("msgs_slam.pipelines.global_ba.stage.JOINT_PX", 0.0)
+    monkeypatch.setattr("msgs_slam.pipelines.mapping.optimise.SNAPSHOT_EVERY", 4)
+    config: Config = load_config(overrides=["mapping.max_side=128"])
     figures = finish(open_stage(whole.run, "global_ba", config))
     assert figures["joint"] in ("kept", "thrown away")
     assert (figures["joint"] == "kept") == (figures["joint_psnr_after"] >= figures["joint_psnr_before"])

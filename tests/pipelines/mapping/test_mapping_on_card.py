@@ -17,7 +17,7 @@ pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip
 
 from msgs_slam.pipelines.compute import gpu  # noqa: E402
 from msgs_slam.pipelines.config import MappingConfig  # noqa: E402
-from msgs_slam.pipelines.mapping import losses  # noqa: E402
+from msgs_slam.pipelines.mapping import growth, losses  # noqa: E402
 from msgs_slam.pipelines.mapping.losses import expose, fit_exposure  # noqa: E402
 from msgs_slam.pipelines.mapping.objective import (  # noqa: E402
     Objective,
@@ -97,7 +97,7 @@ def test_the_loss_without_depth_has_none(monkeypatch: pytest.MonkeyPatch) -> Non
     generator = torch.Generator().manual_seed(1)
     view, features = made_view((9, 12), 0, False, generator)
     leaves = [x.to(DEVICE).requires_grad_() for x in (features, torch.rand(9, 12), torch.rand(9, 12))]
-    objective = Objective(MappingConfig(use_proxy_depth=False), UNIT)
+    objective = Objective(MappingConfig(depth_weight=0.0), UNIT)
     rest = (torch.zeros(3, device=DEVICE), torch.ones(3, dtype=torch.bool, device=DEVICE))
     value = objective.of(there(view), EXPOSURE.to(DEVICE), Rendering(*leaves), *rest)
     assert torch.autograd.grad(value, leaves[1])[0].abs().max() == 0
@@ -133,9 +133,10 @@ def test_the_errors_of_colors_are_the_plain_ones(masked: bool) -> None:
 def started(room: MappingInput) -> Any:
     """A map of the room's first views, and the views."""
     views = [room.views[i] for i in range(3)]
-    settings = MappingConfig(passes=1.0, min_iterations=0, seed_stride=3)
+    settings = MappingConfig(passes=1.0, min_iterations=0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gpu, "supports_triton", lambda example: False)
+        patch.setattr(growth, "SEED_STRIDE", 3)
         return views, optimise_map(views, len(room.class_ids), settings, seed=0), len(room.class_ids)
 
 

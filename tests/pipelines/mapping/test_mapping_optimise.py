@@ -2,6 +2,7 @@
 
 import gc
 import weakref
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +25,15 @@ from msgs_slam.pipelines.mapping.views import MappingInput, View
 from msgs_slam.pipelines.types import VOID
 from tests.killed import KillAt, Killed
 
-SETTINGS = MappingConfig(passes=6.0, min_iterations=0, snapshot_every=20, seed_stride=1)
+SETTINGS = MappingConfig(passes=6.0, min_iterations=0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def dense_and_often_kept() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(growth, "SEED_STRIDE", 1)
+        patch.setattr(optimise, "SNAPSHOT_EVERY", 20)
+        yield
 
 
 def figures(result: OptimisedMap, views: list[View]) -> list[ViewFigures]:
@@ -72,8 +81,10 @@ def test_the_map_is_sound(mapped: OptimisedMap, room: MappingInput) -> None:
 
 def test_splitting_sharpens_a_coarse_map(room: MappingInput, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growth, "FINE_SHARE", 0.0)
+    monkeypatch.setattr(growth, "SEED_STRIDE", 4)
     # The room has no exposures to find, and so coarse a map mistakes its own blur for some.
-    coarse = replace(SETTINGS, seed_stride=4, passes=8.0, exposure=False)
+    monkeypatch.setattr(MapOptimiser, "_expose", lambda *_: None)
+    coarse = replace(SETTINGS, passes=8.0)
     split = optimise_map(room.views, len(room.class_ids), coarse, seed=0)
     monkeypatch.setattr(growth, "SPLIT_ERROR", np.inf)
     unsplit = optimise_map(room.views, len(room.class_ids), coarse, seed=0)
@@ -85,7 +96,8 @@ def test_splitting_sharpens_a_coarse_map(room: MappingInput, monkeypatch: pytest
 def test_splitting_stops_at_the_largest_map(room: MappingInput, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patched:
         patched.setattr(growth, "SPLIT_ERROR", np.inf)
-        few = optimise_map(room.views, len(room.class_ids), replace(SETTINGS, seed_stride=4), seed=0)
+        patched.setattr(growth, "SEED_STRIDE", 4)
+        few = optimise_map(room.views, len(room.class_ids), SETTINGS, seed=0)
     classes, most = len(room.class_ids), len(few.gaussian_map) + 31
     state = OptimiserState.fresh(room.views, classes, few.gaussian_map, None)
     optimiser = MapOptimiser(room.views, classes, replace(SETTINGS, max_gaussians=most), state)
@@ -154,14 +166,19 @@ def test_views_that_are_looked_at_side_by_side_say_the_same(
 
 @pytest.mark.parametrize("at", [9, 75])
 def test_an_interrupted_map_ends_with_the_same_bytes(
-    room: MappingInput, tmp_path: Path, at: int, quick: tuple[MappingConfig, OptimisedMap]
+    room: MappingInput,
+    tmp_path: Path,
+    at: int,
+    quick: tuple[MappingConfig, OptimisedMap],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(growth, "SEED_STRIDE", 3)
     settings, unbroken = quick
     snapshot = tmp_path / "state.safetensors"
     arguments = (room.views, len(room.class_ids), settings, 0)
     with pytest.raises(Killed):
         optimise_map(*arguments, snapshot=snapshot, progress=KillAt(at))
-    assert snapshot.exists() == (at >= settings.snapshot_every)
+    assert snapshot.exists() == (at >= optimise.SNAPSHOT_EVERY)
     result = optimise_map(*arguments, snapshot=snapshot)
     for name, value in vars(unbroken.gaussian_map).items():
         assert torch.equal(getattr(result.gaussian_map, name), value), name
@@ -171,8 +188,10 @@ def test_an_interrupted_map_ends_with_the_same_bytes(
 
 @pytest.fixture(scope="module")
 def quick(room: MappingInput) -> tuple[MappingConfig, OptimisedMap]:
-    settings = replace(SETTINGS, passes=4.0, seed_stride=3)
-    return settings, optimise_map(room.views, len(room.class_ids), settings, seed=0)
+    settings = replace(SETTINGS, passes=4.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(growth, "SEED_STRIDE", 3)
+        return settings, optimise_map(room.views, len(room.class_ids), settings, seed=0)
 
 
 def test_wrong_poses_are_put_right(room: MappingInput, mapped: OptimisedMap, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,7 +248,7 @@ def test_exposure_is_found(room: MappingInput, mapped: OptimisedMap, monkeypatch
 
 
 def test_views_without_classes_can_be_mapped(room: MappingInput) -> None:
-    settings = replace(SETTINGS, passes=1.0, seed_stride=3)
+    settings = replace(SETTINGS, passes=1.0)
     result = optimise_map(room.views[:4], 0, settings, seed=0)
     assert result.gaussian_map.class_logits.shape == (len(result.gaussian_map), 0)
     assert mean(result, room.views[:4], "psnr") > 15

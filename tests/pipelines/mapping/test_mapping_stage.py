@@ -1,6 +1,7 @@
 """The stages mapping and export on a run folder, their files opened by other programs."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from msgs_slam.pipelines.config import Config, ExportConfig, MappingConfig, RunC
 from msgs_slam.pipelines.export import stage as export_stage
 from msgs_slam.pipelines.export.volume import Grid
 from msgs_slam.pipelines.geometry.se3 import Similarity
+from msgs_slam.pipelines.mapping import growth
 from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping.views import load_views
 from msgs_slam.pipelines.run.files import CLASSES, EXPOSURE, MAP, SPARSE, TRAJECTORY
@@ -29,9 +31,16 @@ from tests.pipelines.travelling import Travelling
 
 CONFIG = Config(
     run=RunConfig(device="cpu"),
-    mapping=MappingConfig(passes=3.0, min_iterations=0, seed_stride=1, hold_out=8),
+    mapping=MappingConfig(passes=3.0, min_iterations=0, hold_out=8),
     export=ExportConfig(voxel=0.02),
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def densely_seeded() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(growth, "SEED_STRIDE", 1)
+        yield
 
 
 def context(run: RunFolder, stage: str, config: Config = CONFIG) -> StageContext:

@@ -17,7 +17,7 @@ from msgs_slam.pipelines.config import Config, MappingConfig, RunConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.mapping import stage as mapping_stage
-from msgs_slam.pipelines.mapping import submaps
+from msgs_slam.pipelines.mapping import optimise, submaps
 from msgs_slam.pipelines.mapping.stage import refine_map
 from msgs_slam.pipelines.mapping.submaps import BORDER, SeenExposures, common_exposure, divide, nearest_seeing
 from msgs_slam.pipelines.outcome import load_outcome, maps_around
@@ -156,15 +156,15 @@ def test_parts_show_what_the_whole_shows(small_run: RunFolder, divided: tuple[Pa
 
 
 def test_broken_off_anywhere_it_ends_with_the_same_bytes(
-    small_run: RunFolder, divided: tuple[Path, dict], tmp_path: Path
+    small_run: RunFolder, divided: tuple[Path, dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = replace(CONFIG, mapping=replace(CONFIG.mapping, snapshot_every=20))
+    monkeypatch.setattr(optimise, "SNAPSHOT_EVERY", 20)
     steps = divided[1]["iterations"]  # of the refinement; the making takes as many
     for number, after in enumerate((int(0.4 * steps), int(1.8 * steps))):
         folder = tmp_path / str(number)
         with pytest.raises(Killed):
-            mapped(small_run, folder, config, KillAfter(after))
-        figures = mapped(small_run, folder, config, kind=BackwardsAndTwice)
+            mapped(small_run, folder, CONFIG, KillAfter(after))
+        figures = mapped(small_run, folder, CONFIG, kind=BackwardsAndTwice)
         assert figures == divided[1]
         for name in ("map.safetensors", "trajectory.npz", "exposure.npz", "mapping.json"):
             assert (folder / name).read_bytes() == (divided[0] / name).read_bytes()

@@ -13,7 +13,7 @@ from finished import note_finished
 
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.compute.threads import get_threads, set_threads
-from msgs_slam.pipelines.config import Config, ProxyConfig, RunConfig, with_method
+from msgs_slam.pipelines.config import Config, RunConfig
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.paper import stages
@@ -172,9 +172,6 @@ def test_the_switch_changes_three_stages_and_what_proxies_are() -> None:
     default, chosen = all_stages(), all_stages("paper")
     assert [s.name for s in default] == [s.name for s in chosen]
     assert [s.file.parent.name for s in chosen] == ["frames", "proxy", "paper", "paper", "paper", "export"]
-    assert with_method(Config()) == Config()
-    assert with_method(CONFIG).proxy == ProxyConfig(frames="all", fuse="never", moving="keep")
-    assert with_method(with_method(CONFIG)) == with_method(CONFIG)
 
 
 def test_a_pose_stays_a_rotation_however_long_the_path(whole: RunFolder) -> None:
@@ -193,20 +190,6 @@ def test_kappa_is_a_setting() -> None:
     given = load_config(overrides=["run.method=paper", "run.kappa=5"])
     assert constants_of(given).kappa == 5
     assert constants_of(CONFIG) == PAPER
-
-
-@pytest.mark.parametrize(
-    ("given", "lost"),
-    [(("proxy.fuse=always", "proxy.moving=keep"), ["proxy.fuse=always"]), (("proxy.frames=all",), []), ((), [])],
-)
-def test_a_chosen_setting_that_the_paper_overrides_is_warned_of(
-    given: tuple[str, ...], lost: list[str], tmp_path: Path, world_sequence: Path
-) -> None:
-    words = [str(world_sequence), "--out", str(tmp_path / "run.msgs"), "--until", "frames", "--method", "paper"]
-    done = CliRunner().invoke(main, ["reconstruct", *words, *(w for name in given for w in ("--set", name))])
-    assert done.exit_code == 0, done.output
-    assert [f"{name} is not used" in done.output for name in lost] == [True] * len(lost)
-    assert ("is not used" in done.output) == bool(lost)
 
 
 def dinov2_like(folder: Path) -> Path:

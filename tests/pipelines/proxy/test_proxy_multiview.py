@@ -189,19 +189,21 @@ def test_blurred_steps_of_depth_are_steps_again_and_slopes_stay() -> None:
 
 
 @pytest.mark.parametrize(
-    ("error", "fuse", "expected"),
-    [(0.0, "learned", False), (0.05, "learned", True), (0.05, "never", False), (0.0, "always", True)],
+    ("error", "may_fuse", "expected"),
+    [(0.0, True, False), (0.05, True, True), (0.05, False, False)],
 )
 def test_files_no_better_than_a_network_are_fused_as_one(
-    error: float, fuse: str, expected: bool, room: Room, tmp_path: Path
+    error: float, may_fuse: bool, expected: bool, room: Room, tmp_path: Path
 ) -> None:
     source = write_source(room, tmp_path)
     for frame in room.frames:
         y, x = np.indices(room.views[frame.id].depth.shape) / 40
         off = room.views[frame.id].depth * (1 + 1.4 * error * np.sin(x + frame.id) * np.cos(1.3 * y))
         write_grey_png(tmp_path / "depth" / frame.name, np.round(off * 1000).astype(np.uint16))
-    config = ProxyConfig(depth=f"files:{tmp_path / 'depth'}", fuse=fuse)
-    around = ProviderContext(source, room.sequence(), config, lambda name: tmp_path / name, 1, "cpu", SilentProgress())
+    config = ProxyConfig(depth=f"files:{tmp_path / 'depth'}")
+    around = ProviderContext(
+        source, room.sequence(), config, lambda name: tmp_path / name, 1, "cpu", SilentProgress(), may_fuse=may_fuse
+    )
     assert isinstance(open_depth(around), FusedDepth) == expected
 
 

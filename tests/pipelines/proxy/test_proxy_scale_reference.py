@@ -23,7 +23,7 @@ from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.tracking.stage import run as track
 
 Make = Callable[..., StageContext]
-EMBEDDED = ("proxy.stereo_side=128", "proxy.stereo_planes=32")
+EMBEDDED = ("proxy.stereo_side=128",)
 
 
 def known_length(room: Room, frame: int, points: tuple[tuple[float, float], tuple[float, float]]) -> float:
@@ -134,7 +134,7 @@ def test_metric_depth_wins_and_the_difference_is_told(room: Room, make_context: 
 
 
 def test_a_picture_whose_points_are_lost_says_what_to_choose(make_context: Make) -> None:
-    unfused = ("proxy.depth=files", "proxy.fuse=never", "proxy.semantics=files")
+    unfused = ("proxy.depth=files", "proxy.semantics=files", "run.method=paper")
     context = make_context(*unfused, setting("000005:2.5,3.5,60.5,3.5=1"))
     for path in (context.source.parent / "depth").iterdir():
         path.unlink()

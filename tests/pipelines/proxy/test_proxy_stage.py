@@ -27,7 +27,7 @@ from tests.pipelines.travelling import Travelling
 
 Make = Callable[..., StageContext]
 FILES = ("proxy.depth=files", "proxy.semantics=files")
-EMBEDDED = ("proxy.stereo_side=128", "proxy.stereo_planes=32")
+EMBEDDED = ("proxy.stereo_side=128",)
 
 
 def tree(folder: Path) -> dict[str, bytes]:
@@ -85,8 +85,11 @@ def test_embedded_providers_go_end_to_end(room: Room, make_context: Make) -> Non
 
 
 @pytest.mark.parametrize(("planes", "is_warned"), [(32, False), (4, True)])
-def test_depth_that_is_mostly_filled_in_is_said_to_be(make_context: Make, planes: int, is_warned: bool) -> None:
-    context = make_context("proxy.stereo_side=128", f"proxy.stereo_planes={planes}")
+def test_depth_that_is_mostly_filled_in_is_said_to_be(
+    make_context: Make, planes: int, is_warned: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("msgs_slam.pipelines.proxy.selection.STEREO_PLANES", planes)
+    context = make_context("proxy.stereo_side=128")
     share = run(context)["reliable_pixels"]
     said = [w for w in context.warnings if f"only {share:.0%} of the pixels could be matched" in w]
     assert bool(said) == is_warned
@@ -203,12 +206,14 @@ def card(folder: Path) -> str:
 
 @pytest.mark.parametrize("given", ["embedded", "fused"])
 def test_workers_leave_the_same_bytes(
-    room: Room, make_context: Callable[..., StageContext], tmp_path: Path, given: str
+    room: Room, make_context: Callable[..., StageContext], tmp_path: Path, given: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever depends on all frames (scales, what the scene holds) must reach who works on some of them."""
-    settings: tuple[str, ...] = ("proxy.stereo_side=64", "proxy.stereo_planes=16", "run.cache_mb=0")
+    settings: tuple[str, ...] = ("proxy.stereo_side=64",)
+    monkeypatch.setattr("msgs_slam.pipelines.proxy.selection.CACHE_MB", 0)
     if given == "fused":
-        settings += ("proxy.depth=files", "proxy.fuse=always", f"proxy.semantics={card(tmp_path / 'network')}")
+        monkeypatch.setattr("msgs_slam.pipelines.proxy.selection.LEARNED_SPREAD", 0.0)
+        settings += ("proxy.depth=files", f"proxy.semantics={card(tmp_path / 'network')}")
     whole, divided = make_context(*settings), make_context(*settings, name="divided")
     workers = Travelling(2)
     object.__setattr__(divided, "source", whole.source)

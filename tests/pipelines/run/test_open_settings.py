@@ -65,17 +65,6 @@ def test_a_run_begun_on_a_gpu_goes_on_without_one(
     assert load_settings(run).run == made_with(run).run == Config().run
 
 
-def test_what_the_papers_method_gave_goes_with_it(seen: list[tuple[str, int]], source: Path, tmp_path: Path) -> None:
-    """Otherwise a run that goes back to the default keeps a depth of each frame, and none is fused."""
-    run = RunFolder(tmp_path / "run.msgs")
-    chosen = load_config(overrides=["run.method=paper", "proxy.stereo_side=96"])
-    reconstruct.reconstruct(source, run, chosen, SilentProgress(), until="frames")
-    assert load_settings(run).proxy.frames == "all"
-    back = load_config(overrides=["run.method=default"], base=load_settings(run))
-    reconstruct.resume(run, SilentProgress(), back, until="frames")
-    assert load_settings(run) == load_config(overrides=["proxy.stereo_side=96"])
-
-
 def test_the_threads_of_a_cluster_are_not_those_of_the_run(
     seen: list[tuple[str, int]], source: Path, tmp_path: Path
 ) -> None:

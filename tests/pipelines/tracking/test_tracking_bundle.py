@@ -7,7 +7,6 @@ import numpy as np
 import pycolmap
 import pytest
 
-from msgs_slam.pipelines.config import TrackingConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import align_points
@@ -132,7 +131,7 @@ def test_frames_follow_their_keyframes_but_for_the_errors_of_its_features(
             known = (0.5, -1) if is_keyframe or not is_known else (0.05, keyframe)
             seen = Sightings.of(np.arange(len(points)), exact + off, *known)
             state.add_frame(k, pose, seen if is_keyframe else seen.select(slice(None, None, 7)), is_keyframe, segment=0)
-        adjust_state(state, known_bundle.intrinsics, lambda _: None, False, TrackingConfig())
+        adjust_state(state, known_bundle.intrinsics, lambda _: None, False, True)
         found = np.array([state.poses[i] for i in range(12)])
         after = np.array([1, 2, 4, 5, 7, 8, 10, 11])
         ours, theirs = (p[after] @ se3.inverse(p[after - after % 3]) for p in (found, truth))
@@ -258,7 +257,7 @@ def test_frames_whose_poses_nothing_determines_are_lost() -> None:
     state, intrinsics = walk_state(34, every)
     for i in (15, 20, 21, 33):  # too few of the points to hold, and of the last one nothing is behind
         state.sightings[i] = state.sightings[i].select(np.arange(3))
-    report = adjust_state(state, intrinsics, lambda _: None, False, TrackingConfig())
+    report = adjust_state(state, intrinsics, lambda _: None, False, True)
     before = dict(state.poses)
     assert drop_loose(state, report, intrinsics, least=8) == ([*range(12), 33], [])
     assert sorted(state.poses) == state.keyframes == list(range(12, 33))
@@ -270,7 +269,7 @@ def test_frames_whose_poses_nothing_determines_are_lost() -> None:
 def test_frames_that_follow_loose_keyframes_are_lost_with_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(adjust, "MAX_FRAMES", 10)
     state, intrinsics = walk_state(28, [*range(0, 12, 2), *range(12, 28)])
-    report = adjust_state(state, intrinsics, lambda _: None, False, TrackingConfig())
+    report = adjust_state(state, intrinsics, lambda _: None, False, True)
     assert report.frame_ids == [*range(0, 12, 2), *range(12, 28)]
     loose, _ = drop_loose(state, report, intrinsics, least=8)
     assert loose == list(range(11))  # the last one is followed from the room, too
@@ -280,7 +279,7 @@ def test_frames_that_follow_loose_keyframes_are_lost_with_them(monkeypatch: pyte
 def test_exact_depths_determine_what_the_images_do_not() -> None:
     """Without them a half that lies loosely beside the rest is told of, not lost."""
     state, intrinsics = walk_state(20, range(20))
-    report = adjust_state(state, intrinsics, lambda _: None, False, TrackingConfig())
+    report = adjust_state(state, intrinsics, lambda _: None, False, True)
     assert drop_loose(state, report, intrinsics, least=8) == ([], [list(range(12))])
     z = report.bundle.points_in_cam()[:, 2]
     tied = replace(report, bundle=replace(report.bundle, obs_depth=z, obs_depth_sd=np.full(len(z), 1e-6)))

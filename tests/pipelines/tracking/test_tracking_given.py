@@ -29,7 +29,7 @@ from tests.pipelines.frames.conftest import FOCAL, HEIGHT, QUICK, WIDTH, render,
 
 FRAMES, BLANK = 18, range(7, 11)
 SETTINGS = (
-    *QUICK, "proxy.stereo_side=64", "proxy.stereo_planes=8", "frames.people=keep",
+    *QUICK, "proxy.stereo_side=64", "frames.people=keep",
     f"frames.intrinsics={FOCAL},{FOCAL},{WIDTH / 2},{HEIGHT / 2}",
 )  # fmt: skip
 

@@ -283,13 +283,13 @@ OTHERS = (15, 18, 21, 23)
 
 @pytest.mark.parametrize("hidden", [True, False])
 def test_a_second_model_becomes_a_piece_unless_the_pictures_join_it(
-    hidden: bool, track: Track, make_run: Callable[..., MadeRun], tmp_path: Path
+    hidden: bool, track: Track, make_run: Callable[..., MadeRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("msgs_slam.pipelines.tracking.stage.LEAST_PIECE", 4)
     other = make_run(tmp_path / "other", keyframes=OTHERS, backbone_scale=0.7).run.find(BACKBONE)
     assert other is not None
     made, figures, warnings = track(
         lambda made: SPARSE.save(made.run.stage("frames") / "piece_2", other),
-        load_config(overrides=["frames.least_piece=4"]),
         keyframes=(0, 3, 6, 9), blank=tuple(range(10, 24)) if hidden else (),
     )  # fmt: skip
     if not hidden:
