@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,8 +21,9 @@ from ..source.overlap import Motion
 from ..source.recording import Recording
 from ..source.sharpness import reduce_image, sharpest_of_windows, sharpness
 from ..types import Frame
-from .masks import picked
 
+PICKED, LOSSLESS = "picked", "lossless"
+"""Folders of the snapshot."""
 _TRACKED_SIDE = 480
 _MAX_CORNERS = 600
 _MIN_TRACKS = 30
@@ -107,8 +109,22 @@ class _Tracker:
         return float(np.median(distance)), survivors
 
 
-def pick_frames(context: StageContext, source: Recording, faces: Faces | None) -> list[Frame]:
-    """The sharpest image of every window of time, and more images where these hardly overlap, kept in the snapshot.
+def selected_image_path(context: StageContext, name: str) -> Path:
+    """Return the file of a picked image, before undistortion."""
+    return context.snapshot / PICKED / name
+
+
+def lossless_image_path(context: StageContext, name: str) -> Path:
+    """Return the file that holds a picked image's pixels as they were decoded, where that was asked for."""
+    whole = context.snapshot / LOSSLESS / f"{name}.png"
+    return whole if whole.exists() else selected_image_path(context, name)
+
+
+def pick_frames(
+    context: StageContext, source: Recording, faces: Faces | None, keep_lossless: bool = False
+) -> list[Frame]:
+    """The sharpest image of every window of time, and more images where these hardly overlap, kept in the snapshot,
+    with `keep_lossless` as decoded too: what a lens is taken out of must not be compressed twice.
 
     Raises InputError for a source of one.
     """
@@ -116,18 +132,18 @@ def pick_frames(context: StageContext, source: Recording, faces: Faces | None) -
     if table.exists():
         stored = read_json(table, None)
         frames = [Frame(**row) for row in stored["frames"]]
-        if all(picked(context, f.name).exists() for f in frames):
+        if all(selected_image_path(context, f.name).exists() for f in frames):
             for message in stored["warnings"]:
                 context.warn(message)
             return frames
     config, earlier = context.config.frames, len(context.warnings)  # those before are given again by who gave them
     rate = config.rate if source.is_timed() else 0.0
     motion = Motion()
-    frames = _saved(context, source, faces, _sharpest(context, source, rate, motion))
+    frames = _saved(context, source, faces, keep_lossless, _sharpest(context, source, rate, motion))
     wanted = motion.wanted() if rate > 0 else []
     if len(wanted) > len(frames):
         pictures = context.progress.track(source.read(set(wanted)), "picking", len(wanted))
-        frames = _saved(context, source, faces, ((p, sharpness(p.rgb)) for p in pictures))
+        frames = _saved(context, source, faces, keep_lossless, ((p, sharpness(p.rgb)) for p in pictures))
     context.same_source()
     if len(frames) < 2:
         raise InputError(f"{source.path} gives one frame only; a reconstruction needs several views of a scene")
@@ -151,7 +167,11 @@ def _sharpest(
 
 
 def _saved(
-    context: StageContext, source: Recording, faces: Faces | None, chosen: Iterable[tuple[VideoFrame, float]]
+    context: StageContext,
+    source: Recording,
+    faces: Faces | None,
+    keep_lossless: bool,
+    chosen: Iterable[tuple[VideoFrame, float]],
 ) -> list[Frame]:
     """The frames of images with their sharpness, each written to the snapshot."""
     frames: list[Frame] = []
@@ -160,7 +180,7 @@ def _saved(
         timestamp = picture.timestamp if source.is_timed() else _untimed(context.config.frames, frame_id)
         name = source.name(frame_id, picture.source_index)
         frames.append(Frame(frame_id, name, timestamp, picture.source_index, score))
-        _save_picked(context, source, picture, name, faces)
+        _save_selected(context, source, picture, name, faces, keep_lossless)
     return frames
 
 
@@ -174,15 +194,19 @@ def _untimed(config: FramesConfig, frame_id: int) -> float:
     return frame_id / (config.rate if config.rate > 0 else 1.0)
 
 
-def _save_picked(context: StageContext, source: Recording, picture: VideoFrame, name: str, faces: Faces | None) -> None:
+def _save_selected(
+    context: StageContext, source: Recording, picture: VideoFrame, name: str, faces: Faces | None, keep_lossless: bool
+) -> None:
     if faces is not None:
         for face, rgb in zip(faces.names(name), faces.cut(picture.rgb), strict=True):
-            write_rgb(picked(context, face), rgb)
+            write_rgb(selected_image_path(context, face), rgb)
         return
-    path = picked(context, name)
+    path = selected_image_path(context, name)
     reduced = reduce_image(picture.rgb, context.config.frames.max_side)
     original = source.original(picture.source_index) if reduced is picture.rgb else None
-    if original is None:
-        write_rgb(path, reduced)
-    else:
+    if original is not None:
         copy_file(original, path)
+        return
+    write_rgb(path, reduced)
+    if keep_lossless and path.suffix.lower() != ".png":
+        write_rgb(context.snapshot / LOSSLESS / f"{name}.png", reduced)

@@ -156,6 +156,11 @@ class FrameMasks:
         found = any_of((given, self._still(frame, width, height), moving))
         return found if found is not None and found.any() else None
 
+    def grey(self, frame: Frame) -> Picture:
+        """Load a picked frame in grey, and its mask of pixels to leave out."""
+        gray = to_grey(read_rgb(self._picked / frame.name))
+        return gray, self.left_out(frame, gray.shape[1], gray.shape[0])
+
     def save_still(self, left_out: NDArray[np.bool_], direction: int) -> None:
         """Leave out what stands still (h, w), of any size, in all frames of a direction of the rig."""
         LEFT_OUT.save(self.folder, left_out, _still_name(direction))
@@ -291,22 +296,13 @@ def _by_name(files: list[Path], source: Recording) -> tuple[dict[int, Path], lis
     return paths, [p for i, p in zip(found, files, strict=True) if i is None]
 
 
-def picked(context: StageContext, name: str) -> Path:
-    """The file of an image."""
-    return context.snapshot / "picked" / name
-
-
-def grey_of(context: StageContext, masks: FrameMasks, frame: Frame) -> Picture:
-    """Load a frame in grey, and its mask of pixels to leave out."""
-    gray = to_grey(read_rgb(picked(context, frame.name)))
-    return gray, masks.left_out(frame, gray.shape[1], gray.shape[0])
-
-
 def _still_name(direction: int) -> str:
     return f"still_{direction}"
 
 
 def masks_of(context: StageContext, source: Recording, faces: Faces | None, rig: Rig) -> FrameMasks:
     """Return the masks of all frames; people only in frames that have been searched."""
-    places = context.snapshot / "left_out", context.snapshot / "picked"
+    from .keyframes import PICKED  # imports pycolmap
+
+    places = context.snapshot / "left_out", context.snapshot / PICKED
     return FrameMasks(context.config, source, *places, context.threads, faces, rig)

@@ -14,7 +14,7 @@ from ..masks.still import SAMPLED, find_still
 from ..run.stages import StageContext
 from ..sfm.two_views import HOW_TO_FILM
 from ..types import Frame
-from .masks import FrameMasks, grey_of
+from .masks import FrameMasks
 
 _MOST = 0.65
 """Share of the image beyond which a camera that stands before something that moves is as likely as one that moves."""
@@ -93,7 +93,7 @@ def _found(context: StageContext, masks: FrameMasks, frames: Sequence[Frame], ri
         own = [f for f in frames if f.id // rig.stations == direction]
         rows = np.unique(np.linspace(0, len(own) - 1, min(SAMPLED, len(own))).round().astype(int))
         looked_at = context.progress.track(rows.tolist(), "still parts", len(rows))
-        still = find_still(grey_of(context, masks, own[i]) for i in looked_at)
+        still = find_still(masks.grey(own[i]) for i in looked_at)
         if still is not None and still.left_out.any():
             masks.save_still(still.left_out, direction)
         shares.append(0.0 if still is None else float(still.left_out.mean()))

@@ -25,8 +25,9 @@ from ..source.sharpness import reduced_size
 from ..system.machine import window_size
 from ..system.progress import Progress
 from ..types import Features, Frame, GivenPoses
+from .keyframes import selected_image_path
 from .learned import open_learned, picture_features
-from .masks import FrameMasks, grey_of, masks_of, picked
+from .masks import FrameMasks, masks_of
 
 
 def known_camera(context: StageContext, source: Recording, faces: Faces | None) -> tuple[pycolmap.Camera, str]:
@@ -75,7 +76,9 @@ def structure_from_motion(
         left_out = masks.left_out(frames[frame_id], *size)
 
         def found() -> Features:
-            return picture_features(read_rgb(picked(context, frames[frame_id].name)), left_out, settings, learned)
+            return picture_features(
+                read_rgb(selected_image_path(context, frames[frame_id].name)), left_out, settings, learned
+            )
 
         if snapshots is whole:
             return found()
@@ -90,7 +93,7 @@ def structure_from_motion(
         given=start,
         frame_interval=_interval(frames) if has_times else 0.0,
         extract=extract,
-        picture=lambda frame_id: grey_of(context, masks, frames[frame_id]),
+        picture=lambda frame_id: masks.grey(frames[frame_id]),
         time=lambda frame_id: frames[frame_id].timestamp,
         match=match_features if learned is None else partial(learned.match, size=size),
         snapshots=snapshots,

@@ -91,7 +91,7 @@ def find_faces(source: Recording, config: FramesConfig) -> Faces | None:
     return None if lens is None else fisheye_face(lens, config.max_side)
 
 
-def looks_like_panoramas(source: Recording, config: FramesConfig) -> bool:
+def has_panorama_shape(source: Recording, config: FramesConfig) -> bool:
     """Whether the images have the shape of panoramas, and nothing says what they are."""
     unsaid = config.camera == "auto" and not config.intrinsics and source.dataset() is None
     return unsaid and source.width == 2 * source.height

@@ -27,9 +27,8 @@ from poses import compare, recordings
 from tracking import Case, in_process, original_names, prepare
 
 from msgs_slam.formats.colmap import pose_of
-from msgs_slam.pipelines.frames import stage as frames_stage
 from msgs_slam.pipelines.frames import tasks
-from msgs_slam.pipelines.frames.keyframes import pick_frames
+from msgs_slam.pipelines.frames.stage import FramesStage
 from msgs_slam.pipelines.geometry.camera import ONE_CAMERA
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -37,7 +36,6 @@ from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.sfm import candidates
 from msgs_slam.pipelines.sfm import driver as sfm
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
-from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 SMALL = ("replica", "kitchen", "whiteroom", "fr1_rpy", "house_portrait", "corridor", "office_loop", "bedroom")
@@ -108,12 +106,12 @@ def begun(case: Case, source: Path, folder: Path) -> tuple[sfm.StructureFromMoti
     """Structure from motion of a source, its frames and keyframes; pictures, features and matches stay in `folder`."""
     config = load_config(overrides=["run.threads=1", *case.settings])
     context = StageContext(RunFolder(folder / "no.msgs"), source, config, folder, SilentProgress())
-    opened = open_recording(source, config.run.format)
-    camera, origin = tasks.known_camera(context, opened, None)
-    frames = pick_frames(context, opened, None)
-    masks = tasks.masks_of(context, opened, None, ONE_CAMERA)
-    keyframes = frames_stage._keyframes(context, frames, masks, ONE_CAMERA)
-    return tasks.structure_from_motion(context, camera, origin, frames, masks, ONE_CAMERA, None), frames, keyframes
+    stage = FramesStage(context)
+    stage.open()
+    stage.pick()
+    keyframes, is_timed = stage.keyframes_by_parallax(), stage.recording.is_timed()
+    given = (context, stage.camera, stage.origin, stage.frames, stage.masks, ONE_CAMERA, None, is_timed)
+    return tasks.structure_from_motion(*given), stage.frames, keyframes
 
 
 def measured(name: str, form: str, off: str, work: Path) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from msgs_slam.pipelines.frames.defects import noise_of, shift_of_images
+from msgs_slam.pipelines.frames.findings import noise_of, shift_of_images
 from msgs_slam.pipelines.sfm.adjust import adjust_model
 from msgs_slam.pipelines.sfm.given import bare_model, complete_tracks
 from msgs_slam.pipelines.sfm.lens import unknown_camera

@@ -18,7 +18,7 @@ from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.frames.inputs import check_frames
 from msgs_slam.pipelines.geometry.camera import CUBE, ONE_CAMERA, Rig, rig_of
 from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.source.faces import find_faces, fisheye_face, looks_like_panoramas, panorama_faces
+from msgs_slam.pipelines.source.faces import find_faces, fisheye_face, has_panorama_shape, panorama_faces
 from msgs_slam.pipelines.source.recording import open_recording
 
 WIDTH = 320
@@ -130,8 +130,8 @@ def test_a_fisheye_is_given_by_numbers_or_files(tmp_path: Path, text: str) -> No
 def test_what_cannot_be_is_refused_before_the_work(tmp_path: Path) -> None:
     source = open_recording(_folder(tmp_path, 320, 160))
     assert find_faces(source, FramesConfig()) is None
-    assert looks_like_panoramas(source, FramesConfig())
-    assert not looks_like_panoramas(source, FramesConfig(camera="perspective"))
+    assert has_panorama_shape(source, FramesConfig())
+    assert not has_panorama_shape(source, FramesConfig(camera="perspective"))
     with pytest.raises(InputError, match="--camera fisheye needs the lens"):
         find_faces(source, FramesConfig(camera="fisheye"))
     for text in ("proxy.depth=files", "proxy.scale_ref=1.jpg:1,1,2,2=1"):
