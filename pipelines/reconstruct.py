@@ -22,7 +22,7 @@ from .run.stages import Later, Stage, TaskWorkers
 from .source.recording import open_recording
 from .source.videos import require_different
 from .system.machine import available_cpus, require_device
-from .system.progress import Progress, log
+from .system.progress import Progress
 from .system.wording import quoted
 
 

@@ -42,41 +42,6 @@ def test_files_that_say_the_same(name: str, text: str, tmp_path: Path) -> None:
     assert read_intrinsics(str(tmp_path / name), 640, 480) == Camera(640, 480, 525, 526, 320, 240)
 
 
-_METASHAPE = """<document><chunk><sensors><sensor id="0" label="x"><resolution width="640" height="480"/>
-<calibration class="initial"><resolution width="640" height="480"/><f>900</f></calibration>
-<calibration type="frame" class="adjusted"><resolution width="640" height="480"/><f>526</f><cx>3</cx><cy>-2</cy>
-<k1>-0.1</k1><k2>0.02</k2><k3>0.003</k3><p1>0.001</p1><p2>0.002</p2><b1>-1</b1></calibration></sensor></sensors></chunk>
-</document>"""
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "lens"),
-    [
-        ("cameras.xml", _METASHAPE, (-0.1, 0.02, 0.002, 0.001, 0.003)),
-        ("calib.xml", "<?xml version='1.0'?><calibration><projection>frame</projection><width>640</width>"
-         "<height>480</height><f>526</f><cx>3</cx><cy>-2</cy><b1>-1</b1></calibration>", (0.0, 0.0, 0.0, 0.0)),
-        ("cameras.json", '{"v2 x": {"projection_type": "brown", "width": 640, "height": 480, "focal_x": 0.8203125, '
-         '"focal_y": 0.821875, "c_x": 0.0046875, "c_y": -0.003125, "k1": -0.1, "p2": 0.001}}', (-0.1, 0, 0, 0.001)),
-        ("cameras.sfm", '{"intrinsics": [{"width": "640", "height": "480", "sensorWidth": "36", "type": "radial3", '
-         '"focalLength": "29.53125", "pixelRatio": "0.9980988593155894", "principalPoint": ["3", "-2"], '
-         '"distortionParams": ["-0.1", "0.02", "0.003"]}]}', (-0.1, 0.02, 0.0, 0.0, 0.003)),
-    ],
-)  # fmt: skip
-def test_cameras_of_photogrammetry(name: str, text: str, lens: tuple[float, ...], tmp_path: Path) -> None:
-    (tmp_path / name).write_text(text)
-    camera = read_intrinsics(str(tmp_path / name), 640, 480)
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((525, 526, 323, 238))
-    assert camera.distortion == pytest.approx(lens)
-
-
-def test_record3d_states_a_camera_for_each_image(tmp_path: Path) -> None:
-    each = '"perFrameIntrinsicCoeffs": [[524, 525, 320, 240], [525, 526, 320, 240], [526, 527, 320, 240]]'
-    for matrix in ('"K": [525, 0, 0, 0, 526, 0, 320, 240, 1], ', ""):
-        (tmp_path / "metadata.json").write_text(f'{{{matrix}"w": 640, "h": 480, {each}}}')
-        camera = read_intrinsics(str(tmp_path / "metadata.json"), 640, 480)
-        assert (camera.fx, camera.fy) == (525, 526)
-
-
 @pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"])
 def test_cameras_txt_projects_as_pycolmap_does(model: str, tmp_path: Path) -> None:
     theirs = pycolmap.Camera.create_from_model_name(1, model, 500.0, 640, 480)
@@ -138,43 +103,30 @@ cam1:
   intrinsics: [460, 461, 330, 250]
   resolution: [640, 480]
 """
-ROS = """image_width: 640
+OPENCV = """%YAML:1.0
+---
+image_width: 640
 image_height: 480
-camera_name: narrow
-camera_matrix: {rows: 3, cols: 3, data: [525, 0, 319.5, 0, 526, 239.5, 0, 0, 1]}
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 525., 0., 319.5, 0., 526., 239.5, 0., 0., 1. ]
 distortion_model: rational_polynomial
-distortion_coefficients:
-  rows: 1
-  cols: 8
-  data: [0.1, 0.2, 0, 0, 0.3, 0.4, 0.5, 0.6]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 8
+   dt: d
+   data: [ 0.1, 0.2, 0., 0., 0.3, 0.4, 0.5, 0.6 ]
 """
-ORB_SLAM = """%YAML:1.0
-Camera.type: "PinHole"
-Camera.fx: 525.0
-Camera.fy: 526.0
-Camera.cx: 319.5
-Camera.cy: 239.5
-Camera.k1: 0.262
-Camera.width: 640
-Camera.height: 480
-"""
-PLAIN = (0.0, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
     ("name", "text", "distortion"),
     [
-        ("ros.yaml", ROS, (0.1, 0.2, 0, 0, 0.3, 0.4, 0.5, 0.6)),
-        ("windows.yaml", ROS.replace("\n", "\r\n"), (0.1, 0.2, 0, 0, 0.3, 0.4, 0.5, 0.6)),
+        ("opencv.yaml", OPENCV, (0.1, 0.2, 0, 0, 0.3, 0.4, 0.5, 0.6)),
+        ("windows.yaml", OPENCV.replace("\n", "\r\n"), (0.1, 0.2, 0, 0, 0.3, 0.4, 0.5, 0.6)),
         ("chain.yaml#cam0", KALIBR, (-0.28, 0.07, 0.0001, 1.7e-05)),
-        ("orb.yaml", ORB_SLAM, (0.262, 0, 0, 0)),
-        ("arkit.json", '{"cameraIntrinsics": [525, 0, 0, 0, 526, 0, 319.5, 239.5, 1]}', PLAIN),
-        ("open3d.json", '{"width": 640, "height": 480, "intrinsic_matrix": [525,0,0,0,526,0,319.5,239.5,1]}', PLAIN),
-        ("calib.txt", "P0: 525 0 319.5 0 0 526 239.5 0 0 0 1 0\nP1: 525 0 319.5 -9 0 526 239.5 0 0 0 1 0\nTr: 1 2\n",
-         PLAIN),
-        ("raw.txt", "calib_time: 09-Jan\nS_02: 640 480\nK_02: 525 0 319.5 0 526 239.5 0 0 1\nD_02: .1 0 0 0 0\n",
-         (0.1, 0, 0, 0)),
-        ("calib.cam", "cam0=[525 0 319.5; 0 526 239.5; 0 0 1]\nwidth=640\nheight=480\n", PLAIN),
     ],
 )  # fmt: skip
 def test_files_of_other_programs_count_pixels_from_zero(
@@ -240,15 +192,14 @@ def test_one_of_several_cameras_must_be_named(suffix: str, tmp_path: Path) -> No
     ("name", "text", "what"),
     [
         ("a.yaml", KALIBR, r"cam0 \(640x480, fx 525\), cam1"),
-        ("fov.yaml", ROS.replace("rational_polynomial", "fov"), "lens model fov is not supported"),
-        ("ds.json",
-         '{"a": [{"camera_type": "ds", "intrinsics": {"fx": 1, "fy": 1, "cx": 1, "cy": 1, "xi": 2}}]}', "model ds"),
-        ("xi.yaml", ORB_SLAM + "Camera.xi: 0.9\n", "'xi' is not understood"),
-        ("odd.yaml", ROS.replace("distortion_coefficients", "lens_distortion"), "'lens_distortion' is not understood"),
-        ("tilt.yaml", ROS.replace("0.6]", "0.6, 0.1, 0, 0, 0]"), "distortion is"),
+        ("fov.yaml", OPENCV.replace("rational_polynomial", "fov"), "lens model fov is not supported"),
+        ("ds.yaml", "cam0: {camera_model: ds, intrinsics: [1, 1, 1, 1], resolution: [640, 480]}", "model ds is not"),
+        ("odd.yaml", OPENCV.replace("distortion_coefficients", "lens_dist"), "'lens_dist' is not understood"),
+        ("tilt.yaml", OPENCV.replace("0.6 ]", "0.6, 0.1, 0, 0, 0]"), "distortion is"),
+        ("skew.yaml", OPENCV.replace("525., 0.,", "525., 1.,"), "without skew"),
         ("bomb.yaml", "a: &a [1, 2]\nb: [*a, *a]\n", "aliases"),
-        ("empty.yaml", "{}\n", "files that work: JSON .*ROS"),
-        ("other.xml", "<?xml version='1.0'?><a><f>3</f></a>", "files that work: JSON .*ROS"),
+        ("empty.yaml", "{}\n", "files that work: JSON .*OpenCV"),
+        ("other.xml", "<?xml version='1.0'?><a><f>3</f></a>", "files that work: JSON .*OpenCV"),
         ("short.bin", "nonsense", "damaged or no calibration file"),
     ],
 )  # fmt: skip

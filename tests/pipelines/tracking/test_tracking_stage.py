@@ -16,7 +16,6 @@ from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import (
     BACKBONE,
     CALIBRATION,
