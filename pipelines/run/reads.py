@@ -39,7 +39,7 @@ R = TypeVar("R")
 LOGS = ".reads"
 _FIGURES = ""
 """In the place of a file's name: the figures that a stage's record holds."""
-_OF_MACHINE = {"threads", "device", "memory_mb", "cache_mb"}
+_OF_MACHINE = {"threads", "device", "memory_mb"}
 _active: ContextVar[ReadLog | None] = ContextVar("_active", default=None)
 
 
