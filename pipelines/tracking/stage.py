@@ -66,7 +66,9 @@ class TrackingStage:
         pictures, seed = self.pictures, self.config.run.seed
         state = self._track_frames()
         self._require_poses(state, 2 if self.context.run.find(GIVEN_POSES) is None else 1)
-        report = adjust_state(state, pictures.intrinsics, pictures.proxy, self.is_metric, has_independent_depth(self.proxy))
+        report = adjust_state(
+            state, pictures.intrinsics, pictures.proxy, self.is_metric, has_independent_depth(self.proxy)
+        )
         release_free_memory()
         _, apart = drop_loose(state, report, pictures.intrinsics, LEAST_PIECE)
         carried = carry_given(self.context, state, apart)

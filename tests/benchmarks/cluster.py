@@ -41,11 +41,9 @@ WITH_TASKS = {
 }
 """Stages that submit tasks, and what of their unfinished folder is there once they have."""
 SETTINGS = (
-    "run.threads=1", "frames.rate=4", "frames.max_features=600", "proxy.stereo_side=96", "proxy.stereo_planes=24",
+    "run.threads=1", "frames.rate=4", "frames.max_features=600", "proxy.stereo_side=96",
     "mapping.passes=1", "mapping.min_iterations=20", "mapping.max_side=160", "mapping.submap=6", "export.voxel=0.03",
-    "global_ba.joint=always",
 )  # fmt: skip
-"""The clip has no loops, without which nothing would be refined by global_ba."""
 BETWEEN_KILLS = (0.05, 0.6)
 """Seconds."""
 BAD = {

@@ -16,8 +16,8 @@ from msgs_slam.formats.tensors import load_tensors
 from msgs_slam.pipelines.config import Config, MappingConfig, RunConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
-from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping import optimise, submaps
+from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping.stage import refine_map
 from msgs_slam.pipelines.mapping.submaps import BORDER, SeenExposures, common_exposure, divide, nearest_seeing
 from msgs_slam.pipelines.outcome import load_outcome, maps_around
