@@ -82,11 +82,7 @@ def world(finished_run: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -
     (given / "net").mkdir()
     save_network(given / "net" / "net.onnx", PICTURE, "float[1, 3, H, W] y", "y = Mul (x, gain)", gain=[2.0])
     (given / "net" / "card.toml").write_text(LABELS)
-<<<<<<< HEAD
-    settings = [x for s in (*QUICK, "proxy.fuse=never", "frames.parallax=0.2") for x in ("--set", s)]
-=======
-    settings = [x for s in (*QUICK, "export.texture=off") for x in ("--set", s)]
->>>>>>> 6402c4f1 (Tests and pages know the settings that there are)
+    settings = [x for s in (*QUICK, "frames.parallax=0.2") for x in ("--set", s)]
     options = ("--poses", given / "poses.txt", "--intrinsics", given / "camera.txt", "--masks", given / "masks")
     proxies = ("--depth", f"files:{given / 'depth'}", "--semantics", f"onnx:{given / 'net' / 'card.toml'}")
     run_one = runner._run_one
@@ -179,13 +175,8 @@ def test_settings_that_were_not_asked_for_change_nothing(world: World) -> None:
             assert changed == {s for s, r in world.records.items() if name in r.reads.settings}, name
             for stage in changed:
                 counts[stage] += 1
-<<<<<<< HEAD
-    assert min(counts.values()) > 3
-    unread = {"proxy.stereo_planes", "proxy.stereo_side", "run.kappa"}  # depth is given
-=======
     assert min(counts.values()) > 1
-    unread = {"proxy.stereo_side"}  # depth is given
->>>>>>> 6402c4f1 (Tests and pages know the settings that there are)
+    unread = {"proxy.stereo_side", "run.kappa"}  # depth is given
     assert not unread & {name for record in world.records.values() for name in record.reads.settings}
 
 
