@@ -294,7 +294,7 @@ _EXP2 = (1.0, 0.693147206, 0.240226466, 0.0555032900, 0.00961851953, 0.001339986
 
 
 @intrinsic
-def exp(typing_context: Any, value: Any) -> Any:
+def lane_exp(typing_context: Any, value: Any) -> Any:
     """e to each lane, for arguments <= 0 (less than -80 counts as -80); relative error about 1e-7."""
 
     def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:

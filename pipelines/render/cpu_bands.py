@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compute.lanes import any_lane, exp, iota, load, maximum, min_scalar, splat, store, where
+from ..compute.lanes import any_lane, iota, lane_exp, load, maximum, min_scalar, splat, store, where
 from ..compute.threads import PART, for_each, fused_kernel, inner
 from . import rules
 
@@ -365,8 +365,8 @@ def walk_tiles(
             sharpness = -_HALF / (records[at + 2] * records[at + 2])
             dx, dy = iota(_HALF - u), iota(_HALF - v)
             dx2 = dx * dx
-            store(falloff_y, 0, exp(dy * dy * sharpness) * records[at + 4])
-            pair = (exp(dx2 * sharpness), dx, dx2, v, reach * reach, records[at + 3])
+            store(falloff_y, 0, lane_exp(dy * dy * sharpness) * records[at + 4])
+            pair = (lane_exp(dx2 * sharpness), dx, dx2, v, reach * reach, records[at + 3])
             visit(job, kind, light, falloff_y, i, (x0, x1, y0, y1), pair)
             if k % CHECK_EVERY == CHECK_EVERY - 1 and is_opaque(light):
                 break

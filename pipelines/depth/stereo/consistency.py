@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compute.lanes import any_lane, exp, iota, load, maximum, min_scalar, splat, store, where
+from ...compute.lanes import any_lane, iota, lane_exp, load, maximum, min_scalar, splat, store, where
 from ...compute.threads import fused_kernel, inner
 from ...geometry.camera import project
 from ...geometry.sparse_model import SparseModel
@@ -105,7 +105,7 @@ def _fuse_band(
                 back = seen * (ou * b[0] + ov * b[1] + b[2]) + b[3]
                 agrees = shown & (maximum(off, splat(_ZERO) - off) < _THREE * tolerance) & (back > _ZERO)
                 off = where(agrees, off * (_ONE / tolerance))
-                weight = where(agrees, exp(off * off * -_HALF))
+                weight = where(agrees, lane_exp(off * off * -_HALF))
                 weights, total = weights + weight, total + weight / choose(agrees, back, splat(_ONE))
             store(rows[1], x, where(known, weights / total))
             store(rows[2], x, weights - _ONE)

@@ -11,7 +11,7 @@ All that correlates is part of one kernel and takes sixteen pixels at once: rows
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compute.lanes import exp, iota, load, maximum, min_scalar, splat, store, where
+from ...compute.lanes import iota, lane_exp, load, maximum, min_scalar, splat, store, where
 from ...compute.threads import fused_kernel, inner
 from ...providers import DepthEstimate
 from ...system.jit import kernel
@@ -80,7 +80,7 @@ def weigh_windows(
                 for i in range(SIDE):
                     value = load(rows, (k + j * STEP) * length + i * STEP + x)
                     off = value - middle
-                    weight = exp(off * off * narrow) + floor
+                    weight = lane_exp(off * off * narrow) + floor
                     store(weights, own + (j * SIDE + i) * length, weight)
                     total, mean, square = total + weight, mean + weight * value, square + weight * value * value
             share = splat(_ONE) / total
