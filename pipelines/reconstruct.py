@@ -11,7 +11,7 @@ from ..formats.video import probe_video
 from .config import GPS_AUTO, GPS_OFF, SOURCE_LIST, STAGES, Config
 from .frames.inputs import check_frames, frames_division
 from .mapping.division import mapping_division
-from .proxy.inputs import check_proxy
+from .proxy.selection import check_proxy
 from .read_config import with_absolute_paths
 from .run.folder import RunFolder, load_records, load_settings, load_source
 from .run.lock import LOCK, SOFT_LOCK, locked, make_folder

@@ -29,7 +29,7 @@ from ..types import Frame, Intrinsics
 Array = NDArray[np.float64]
 DepthOf = Callable[[Frame], DepthEstimate]
 
-_NUMBER = r"\s*([0-9.]+)\s*"
+_NUMBER = r"\s*(\d+\.?\d*|\.\d+)\s*"
 _DISTANCE = re.compile(rf"(.+):{_NUMBER},{_NUMBER},{_NUMBER},{_NUMBER}={_NUMBER}m?")
 _HEIGHT = re.compile(rf"height\s*={_NUMBER}m?")
 POSES = "poses"
@@ -66,16 +66,22 @@ class ReferenceScale:
 
 def parse_reference(text: str) -> Reference | None:
     """The length a setting describes, None for "" and for poses. Raises InputError for a malformed one."""
-    if text.strip() in ("", POSES):
+    text = text.strip()
+    if text in ("", POSES):
         return None
-    if found := _HEIGHT.fullmatch(text.strip()):
-        return Reference(_positive(found[1], text))
-    if not (found := _DISTANCE.fullmatch(text.strip())):
+    height, distance = _HEIGHT.fullmatch(text), _DISTANCE.fullmatch(text)
+    if height:
+        reference = Reference(float(height[1]))
+    elif distance:
+        x1, y1, x2, y2, metres = map(float, distance.groups()[1:])
+        reference = Reference(metres, distance[1].strip(), ((x1, y1), (x2, y2)))
+        if np.hypot(x2 - x1, y2 - y1) < _MIN_APART:
+            raise InputError(f"--scale-ref {text}: the two pixels are nearly the same; take points farther apart")
+    else:
         raise InputError(f"--scale-ref {text}: expected {_HOW}")
-    x1, y1, x2, y2 = (_number(found[k], text) for k in range(2, 6))
-    if np.hypot(x2 - x1, y2 - y1) < _MIN_APART:
-        raise InputError(f"--scale-ref {text}: the two pixels are nearly the same; take points farther apart")
-    return Reference(_positive(found[6], text), found[1].strip(), ((x1, y1), (x2, y2)))
+    if not 0 < reference.metres < 1e4:
+        raise InputError(f"--scale-ref {text}: {reference.metres} metres make no sense; give the length in metres")
+    return reference
 
 
 def require_reference_in(source: Recording, text: str) -> None:
@@ -97,22 +103,24 @@ def distance_scale(
     They are followed into the nearest keyframes and measured in each by its depth; the median counts. Raises
     InputError when no keyframe near the image sees both with reliable depth.
     """
-    index = _picture_index(source, reference.picture)
+    index, camera = _picture_index(source, reference.picture), sequence.intrinsics
     picture = next(iter(source.read({index})), None)
     if picture is None:
         raise InputError(f"--scale-ref: the source has no image {reference.picture}")
-    points = np.array(reference.points) * [
-        sequence.intrinsics.width / picture.rgb.shape[1], sequence.intrinsics.height / picture.rgb.shape[0]
-    ]  # fmt: skip
-    small = resize_area(picture.rgb, sequence.intrinsics.width, sequence.intrinsics.height)
-    near = sorted(frames, key=lambda f: (abs(f.source_index - index), f.id))[:_KEYFRAMES]
+    full_height, full_width = picture.rgb.shape[:2]
+    points = np.array(reference.points) * [camera.width / full_width, camera.height / full_height]
+    grey = to_grey(resize_area(picture.rgb, camera.width, camera.height))
     lengths, relative_sds = [], []
-    for frame in near:
-        followed = _follow(small, sequence.image(frame), points)
-        length = None if followed is None else _length(followed, depth_of(frame), sequence.intrinsics)
-        if followed is not None and length is not None:
+    for frame in sorted(frames, key=lambda f: (abs(f.source_index - index), f.id))[:_KEYFRAMES]:
+        other, found = to_grey(sequence.image(frame)), np.ones(2, bool)
+        # The one is an image of the source, the other without lens distortion: of one instant, too, points move.
+        at = points
+        if not np.array_equal(grey, other):
+            at, found = follow(grey, other, points, points, levels=4)
+        length = _length(at, depth_of(frame), camera) if found.all() else None
+        if length is not None:
             lengths.append(length)
-            relative_sds.append(_PIXEL_SD * np.sqrt(2) / float(np.linalg.norm(followed[1] - followed[0])))
+            relative_sds.append(_PIXEL_SD * np.sqrt(2) / float(np.linalg.norm(at[1] - at[0])))
     if not lengths:
         raise InputError(
             f"--scale-ref: no keyframe near image {reference.picture} has reliable depth at both points. Choose "
@@ -121,12 +129,6 @@ def distance_scale(
     length = float(np.median(lengths))
     spread = 1.4826 * float(np.median(np.abs(np.array(lengths) / length - 1)))
     return ReferenceScale(reference.metres / length, float(np.hypot(spread, np.median(relative_sds))), len(lengths))
-
-
-def height_scale(reference: Reference, heights: Array) -> ReferenceScale:
-    """The scale that puts the cameras, `heights` (N,) units over the floor, at the known height on average."""
-    height = float(np.median(heights))
-    return ReferenceScale(reference.metres / height, float(np.std(heights)) / height, len(heights))
 
 
 def _picture_index(source: Recording, picture: str) -> int:
@@ -144,15 +146,6 @@ def _picture_index(source: Recording, picture: str) -> int:
     raise InputError(f"--scale-ref: the source has no image {picture}; give its name, for example {names[0]}")
 
 
-def _follow(first: NDArray[np.uint8], second: NDArray[np.uint8], points: Array) -> Array | None:
-    """(2, 2) the points of one image in another, by optical flow there and back."""
-    a, b = to_grey(first), to_grey(second)
-    if np.array_equal(a, b):
-        return points
-    there, found = follow(a, b, points, points, levels=4)
-    return there if found.all() else None
-
-
 def _length(points: Array, estimate: DepthEstimate, camera: Intrinsics) -> float | None:
     """Distance of two pixels (2, 2) in the depth's unit; None where a depth is not reliable."""
     depths = []
@@ -167,20 +160,6 @@ def _length(points: Array, estimate: DepthEstimate, camera: Intrinsics) -> float
     return float(np.linalg.norm(second - first))
 
 
-def _number(text: str, whole: str) -> float:
-    try:
-        return float(text)
-    except ValueError as error:
-        raise InputError(f"--scale-ref {whole}: {text!r} is no number. Expected {_HOW}") from error
-
-
-def _positive(text: str, whole: str) -> float:
-    value = _number(text, whole)
-    if not 0 < value < 1e4:
-        raise InputError(f"--scale-ref {whole}: {value} metres make no sense; give the length in metres")
-    return value
-
-
 def reference_scale(
     context: StageContext,
     sequence: Sequence,
@@ -191,22 +170,12 @@ def reference_scale(
 ) -> ReferenceScale | None:
     """Find the metres per unit of the depth by what the user knows; None without that, and where the depth is metric.
 
-    Args:
-        context: settings and source of the stage.
-        sequence: the frames with their cameras.
-        frames: those with depth.
-        depths: the provider of the depth.
-        scale: the depth's unit in that of the backbone.
-        depth_of: loads the depth of a frame.
-
     Raises InputError when the reference cannot be measured in this scene.
     """
     config = context.config.proxy
     known = parse_reference(config.scale_ref)
     if known is None:
-        is_said = config.scale_ref.strip() == POSES
-        return None if depths.metric else given_scale(context.run, scale, is_said)
-
+        return None if depths.metric else given_scale(context.run, scale, config.scale_ref.strip() == POSES)
     if known.picture:
         source = open_recording(context.source, context.config.run.format)
         found = distance_scale(known, source, sequence, frames, depth_of)
@@ -217,7 +186,9 @@ def reference_scale(
             raise InputError(
                 f"--scale-ref {config.scale_ref}: no floor was found in the scene. Give a distance between two points"
             )
-        found = height_scale(known, heights * scale.value)
+        heights = heights * scale.value
+        height = float(np.median(heights))
+        found = ReferenceScale(known.metres / height, float(np.std(heights)) / height, len(heights))
     if depths.metric:
         context.warn(
             f"{depths.name} is metric, so the reference {config.scale_ref} is not used; it would make lengths "

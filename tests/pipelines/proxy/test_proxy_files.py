@@ -15,8 +15,9 @@ from msgs_slam.formats.images import write_grey_png, write_rgb
 from msgs_slam.pipelines.depth.files import FilesDepth, frame_key, match_files
 from msgs_slam.pipelines.labels.files import FilesLabels
 from msgs_slam.pipelines.providers import DepthEstimate, Sequence
-from msgs_slam.pipelines.proxy.inputs import _before_frames, check_proxy
 from msgs_slam.pipelines.proxy.selection import (
+    _before_frames,
+    check_proxy,
     choose_depth,
     choose_semantics,
     open_learned_depth,

@@ -11,7 +11,7 @@ from proxy_room import Room, write_source
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.proxy.inputs import check_proxy
+from msgs_slam.pipelines.proxy.selection import check_proxy
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder

@@ -1,8 +1,11 @@
 """The table of models and the downloader, against a server of the test's own on loopback."""
 
 import hashlib
+import re
+import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -13,6 +16,7 @@ import pytest
 
 from msgs_slam.formats.errors import DiskFullError, InputError
 from msgs_slam.pipelines.config import ProxyConfig
+from msgs_slam.pipelines.networks import registry
 from msgs_slam.pipelines.networks.registry import Model, ModelStore, fetch
 from msgs_slam.pipelines.proxy.selection import choose_depth
 from msgs_slam.pipelines.read_config import load_config
@@ -26,11 +30,8 @@ class Behaviour:
     """What the server does with the next requests, and what it saw."""
 
     cuts: list[int] = field(default_factory=list)
-    ranges: bool = True
     missing: tuple[str, ...] = ()
-    data: bytes = DATA
-    etag: str = '"one"'
-    requests: list[tuple[str, str]] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
 
 
 @pytest.fixture
@@ -39,17 +40,13 @@ def server() -> Iterator[tuple[str, Behaviour]]:
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            wanted = self.headers.get("Range", "")
-            behaviour.requests.append((self.path, wanted))
+            behaviour.requests.append(self.path)
             if self.path in behaviour.missing:
                 self.send_error(404)
                 return
-            same = self.headers.get("If-Range", behaviour.etag) == behaviour.etag
-            start = int(wanted[6:-1]) if wanted and behaviour.ranges and same else 0
-            body = behaviour.data[start:]
-            self.send_response(206 if start else 200)
+            body = DATA
+            self.send_response(200)
             self.send_header("Content-Length", str(len(body)))
-            self.send_header("ETag", behaviour.etag)
             self.end_headers()
             if behaviour.cuts:
                 body = body[: behaviour.cuts.pop(0)]
@@ -87,7 +84,7 @@ def test_404_and_a_wrong_hash_go_to_the_next_mirror(
     url, behaviour = server
     behaviour.missing = ("/gone",)
     fetch([f"{url}/gone", f"{url}/m"], tmp_path / "m.onnx", len(DATA), SHA, silent)
-    assert [p for p, _ in behaviour.requests] == ["/gone", "/m"]
+    assert behaviour.requests == ["/gone", "/m"]
     assert [r.getMessage().count("404 Client Error: Not Found") for r in caplog.records] == [1]
     with pytest.raises(InputError, match=r"does not match"):
         fetch([f"{url}/m"], tmp_path / "n.onnx", len(DATA), "0" * 64, silent)
@@ -246,3 +243,97 @@ def test_a_model_that_needs_another_is_here_when_both_are(server: tuple[str, Beh
     pair.pull(head, silent, trust=True)
     pinned = Model("head", "head", head.urls, 0, SHA, "MIT", True)
     assert ModelStore(tmp_path, (body, pinned), models.families).first_here("segmentation") == body
+
+
+Serve = Callable[..., str]
+OK = b"HTTP/1.1 200 OK\r\n"
+
+
+@pytest.fixture
+def serve() -> Iterator[Serve]:
+    """A server that answers every request with these pieces."""
+    listening: list[socket.socket] = []
+
+    def start(*pieces: bytes) -> str:
+        server = socket.create_server(("127.0.0.1", 0))
+        listening.append(server)
+
+        def answer() -> None:
+            with suppress(OSError):
+                while True:
+                    line, _ = server.accept()
+                    with suppress(OSError), line:
+                        line.recv(65536)
+                        for piece in pieces:
+                            line.sendall(piece)
+
+        threading.Thread(target=answer, daemon=True).start()
+        return f"http://127.0.0.1:{server.getsockname()[1]}/m"
+
+    yield start
+    for server in listening:
+        server.close()
+
+
+def refused(urls: list[str], target: Path) -> str:
+    with pytest.raises(InputError) as error:
+        fetch(urls, target, 1000, "", lambda done, size: None)
+    assert not target.is_file()
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    "location",
+    [
+        b"http://example.invalid/m", b"ftp://127.0.0.1/m", b"file:///etc/passwd", b"http://[::1/x y",
+        b"http://127.0.0.1.example.invalid/m", b"data:,x",
+    ],
+)  # fmt: skip
+def test_redirects_lead_to_https_only(serve: Serve, tmp_path: Path, location: bytes) -> None:
+    url = serve(b"HTTP/1.1 302 Found\r\nLocation: " + location + b"\r\nContent-Length: 0\r\n\r\n")
+    assert re.search("only https|Invalid", refused([url], tmp_path / "m"))
+
+
+def test_this_machine_is_reached_from_itself_alone() -> None:
+    assert registry._is_safe("http://localhost:8000/m")
+    for url in (
+        "http://127.0.0.1.example.invalid/m",
+        "http://example.invalid/m",
+        "ftp://example.invalid/m",
+        "https://",
+    ):
+        assert not registry._is_safe(url)
+    assert not registry._is_safe("http://localhost:8000/m", from_own_host=False)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        OK + b"Transfer-Encoding: chunked\r\n\r\n-5\r\nabc\r\n",
+        OK + b"Transfer-Encoding: chunked\r\n\r\n" + b"f" * 5000 + b"\r\n",
+        OK + b"Content-Length: " + b"9" * 5000 + b"\r\n\r\nabc",
+        OK + b"Content-Length: -3\r\n\r\nabc",
+        OK + b"X: 1\r\n" * 1000 + b"\r\n",
+        b"HTTP/1.1 999999999999999999999 x\r\n\r\n",
+        b"\xff" * 100_000,
+        b"",
+    ],
+)
+def test_answers_that_make_no_sense_are_reasons(serve: Serve, tmp_path: Path, answer: bytes) -> None:
+    assert "could not be downloaded" in refused([serve(answer)], tmp_path / "m")
+
+
+def test_folders_in_the_way(serve: Serve, tmp_path: Path) -> None:
+    url = serve(OK + b"Content-Length: 1000\r\n\r\n" + b"x" * 1000)
+    (tmp_path / "n").mkdir()
+    assert "is a folder" in refused([url], tmp_path / "n")
+    (tmp_path / "m").write_bytes(b"")
+    assert "choose another cache" in refused([url], tmp_path / "m" / "below a file")
+
+
+def test_a_server_that_sends_without_end_is_left(serve: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_MAX_UNKNOWN", 1000)
+    url = serve(OK + b"\r\n", *[b"x" * registry._CHUNK] * 4)
+    with pytest.raises(InputError, match="more than the expected 1000 bytes"):
+        fetch([url], tmp_path / "m", 0, "", lambda done, size: None)
+    assert not list(tmp_path.iterdir())

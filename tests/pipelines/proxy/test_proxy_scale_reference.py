@@ -11,8 +11,8 @@ from proxy_room import UNIT, Room
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
 from msgs_slam.pipelines.geometry.camera import unproject, unproject_depth
-from msgs_slam.pipelines.proxy.inputs import check_proxy
 from msgs_slam.pipelines.proxy.reference import Reference, parse_reference
+from msgs_slam.pipelines.proxy.selection import check_proxy
 from msgs_slam.pipelines.proxy.stage import run
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
@@ -52,7 +52,7 @@ def test_references_are_read() -> None:
         ("0.6", "expected IMAGE:X1"),
         ("height=-1", "expected IMAGE:X1"),
         ("height=0", "make no sense"),
-        ("height=1.2.3", "is no number"),
+        ("height=1.2.3", "expected IMAGE:X1"),
         ("000003.png:1,2,3=1", "expected IMAGE:X1"),
         ("000003.png:100,20,100.5,20=1", "nearly the same"),
         ("000003.png:10,20,100,20=99999", "make no sense"),

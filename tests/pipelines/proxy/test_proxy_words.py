@@ -23,7 +23,7 @@ from msgs_slam.pipelines.networks.card import read_card
 from msgs_slam.pipelines.networks.outputs import network_probabilities
 from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.networks.words import MAX_WORDS, with_words
-from msgs_slam.pipelines.proxy.inputs import check_proxy
+from msgs_slam.pipelines.proxy.selection import check_proxy
 from msgs_slam.pipelines.proxy.stage import run
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import CLASSES, PROXY_MAPS
