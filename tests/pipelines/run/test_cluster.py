@@ -20,24 +20,17 @@ from msgs_slam.pipelines.run import cluster as cluster_module
 from msgs_slam.pipelines.run.cluster import RETRIES, RayCluster
 from msgs_slam.pipelines.system.progress import SilentProgress, Stopped, soft_stop
 from tests.pipelines import task_calls
+from tests.ray_nodes import two_nodes
 
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra [cluster]")
 
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[RayCluster]:
-    from ray.cluster_utils import Cluster
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))  # as an installed program is found
-        patch.setenv("RAY_memory_monitor_refresh_ms", "0")
-        patch.setenv("RAY_worker_niceness", "0")  # with its 15 anything else starves the tasks
-        nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-        nodes.add_node(num_cpus=1)
+    with two_nodes() as (nodes, _):
         found = RayCluster(nodes.address, threads=1)
         yield found
         found.close()
-        nodes.shutdown()
 
 
 def each(cluster: RayCluster, work: Any, tasks: Any, folder: Path) -> list[Any]:
