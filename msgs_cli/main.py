@@ -14,7 +14,8 @@ import click
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from ..formats.errors import InputError, SettingError
-from ..pipelines.config import EXPORTS, STAGES
+from ..pipelines.config import STAGES
+from ..pipelines.export.kinds import EXPORTS, KIND_OF, kinds_help
 from ..pipelines.system.wording import quoted
 from . import results
 from .batch import batch
@@ -108,20 +109,12 @@ class SettingRefused(click.ClickException):
     exit_code = click.UsageError.exit_code
 
 
-_COMES_WITH = {"nerfstudio": "colmap"}
-"""Of `export --only`: written together with another kind."""
-_MEANT = {"texture": "mesh", "gltf": "glb", "usdz": "usd", "gaussians": "ply", "splat": "ply", "point_cloud": "ply",
-          "pointcloud": "ply", "poses": "tum", "trajectory": "tum", "transforms": "nerfstudio", "3dtiles": "tiles",
-          "web": "html", "page": "html", "map": "html", "svg": "floorplan", "plan": "floorplan"}  # fmt: skip
-"""What people call a kind of file → its name."""
-
-
 class KindOfFile(click.Choice[str]):
     """The kinds of `export --only`, by the names of their formats too."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Take a format's name for its kind, then check as click does."""
-        return super().convert(_MEANT.get(str(value).lower(), str(value).lower()), param, ctx)
+        return super().convert(KIND_OF.get(str(value).lower(), value), param, ctx)
 
 
 _SYSTEM_REFUSES = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENAMETOOLONG}
@@ -140,7 +133,7 @@ def main() -> None:
     msgs-slam extend RUN more.mp4       extend a finished run with another video
     msgs-slam batch FOLDER --out RUNS   many recordings, on one machine or many
     msgs-slam status video.msgs         what is done, what was found
-    msgs-slam export video.msgs         write the export files again, or elsewhere
+    msgs-slam export video.msgs         write more kinds of files, or elsewhere
     msgs-slam report video.msgs         one HTML page: what was found, how good, what to film better
     msgs-slam render video.msgs out.mp4 the map along its camera path
     msgs-slam view video.msgs           the map in the browser
@@ -265,13 +258,27 @@ def extend_command(run_path: Path, videos: tuple[Path, ...], output: Output) -> 
     report_run(output, run.root, records)
 
 
-@main.command()
+_EXPORT_HELP = f"""Export a finished RUN to files for other programs. What the run writes by itself is in RUN/export and
+stays as it is.
+
+\b
+Kinds for --only, and settings (--set export.NAME=VALUE) of each:
+{kinds_help()}
+
+Settings hold for the files that are written; `msgs-slam resume RUN --set ...` changes them in the run itself.
+
+\b
+Example: msgs-slam export video.msgs --only ply --to shared
+"""
+
+
+@main.command(help=_EXPORT_HELP)
 @RUN_ARGUMENT
 @click.option(
-    "--only", type=KindOfFile([*EXPORTS, *_COMES_WITH]),
-    help="Write one kind of file only; nerfstudio's comes with colmap. Default: all.",
+    "--only", type=KindOfFile([row.kind for row in EXPORTS]), metavar="KIND",
+    help="Write one kind of file only. Default: all that the run itself writes.",
 )  # fmt: skip
-@click.option("--to", type=FOLDER, metavar="DIR", help="Where to write. Default: RUN/export.")
+@click.option("--to", type=FOLDER, metavar="DIR", help="Where to write. Default: RUN/exports/KIND, or all.")
 @OVERWRITE
 @settings_options
 @verbosity_options
@@ -284,21 +291,7 @@ def export(
     overrides: tuple[str, ...],
     output: Output,
 ) -> None:
-    """Export to other formats: COLMAP model, Gaussian PLY, SPZ, SOG or GLB, labelled mesh, textured mesh,
-    TUM trajectory; `--only html`: one web page that shows the map, to send to somebody; `--only tiles`: 3D Tiles for
-    CesiumJS; `--only collision`: a light mesh to walk in; `--only usd`: the
-    mesh as USDZ; `--only floorplan`: the walls from above with their lengths.
-
-    Other settings than the run's own (--set export.voxel=0.02) need --to; `msgs-slam resume RUN
-    --set ...` changes them in the run itself.
-
-    \b
-    Example: msgs-slam export video.msgs --only ply --to shared
-    """
-    if (config_file or overrides) and (to is None or to.resolve() == (run_path / "export").resolve()):
-        raise click.UsageError(
-            "add --to DIR, a folder outside of the run: files of other settings (--set, --config) do not go into it"
-        )
+    """Write exports, as the help above says."""
     if others := [text for text in overrides if not text.startswith("export.")]:
         raise click.UsageError(
             f"--set {others[0]}: an export has the settings of [export] alone; of the rest of the run: "
@@ -308,13 +301,13 @@ def export(
     from ..pipelines.reconstruct import made_with
 
     run = open_run(run_path)
-    from ..pipelines.export.stage import export_run
+    from ..pipelines.export.stage import export_folder, export_run
 
     use_threads(run)
     settings = with_absolute_paths(load_config(config_file, overrides, base=made_with(run))).export
-    kind, folder = _COMES_WITH.get(only or "", only), to or run.stage("export")
+    folder = to or export_folder(run, only)
     with on_sigterm(signal.SIG_DFL):
-        written = export_run(run, folder, kind, output.progress(), settings, overwrite)
+        written = export_run(run, folder, only, output.progress(), settings, overwrite)
     for path in written:
         if not output.quiet:
             say(path)

@@ -4,9 +4,6 @@ from dataclasses import Field, dataclass, field, fields, is_dataclass
 from typing import Any
 
 STAGES = ("frames", "proxy", "tracking", "mapping", "global_ba", "export")
-EXPORTS = (
-    "colmap", "ply", "spz", "sog", "glb", "tiles", "html", "mesh", "collision", "usd", "floorplan", "tum",
-)  # fmt: skip
 GPS_OFF, GPS_AUTO = "off", "auto"
 EXTENSION = "extension_"
 """Begins the folder of a run in which what it was before it was extended is kept."""

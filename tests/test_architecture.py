@@ -230,8 +230,8 @@ print(*(name if name.startswith("msgs_slam") else name.partition(".")[0] for nam
 """
 LIGHT = {
     "click", "msgs_slam", "msgs_slam.formats", "msgs_slam.formats.errors", "msgs_slam.pipelines",
-    "msgs_slam.pipelines.config", "msgs_slam.pipelines.system", "msgs_slam.pipelines.system.progress",
-    "msgs_slam.pipelines.system.wording",
+    "msgs_slam.pipelines.config", "msgs_slam.pipelines.export", "msgs_slam.pipelines.export.kinds",
+    "msgs_slam.pipelines.system", "msgs_slam.pipelines.system.progress", "msgs_slam.pipelines.system.wording",
 }  # fmt: skip
 """All that the help may load beside the standard library and the command line's own modules."""
 

@@ -82,7 +82,7 @@ def texts_of_help(command: click.Command, name: str) -> Iterator[tuple[str, str]
 def texts_of_pages() -> Iterator[tuple[str, str]]:
     for page in PAGES:
         yield str(page.relative_to(ROOT)), prose(page)
-    for path in sorted((ROOT / "pipelines" / "export" / "extra" / "page").iterdir()):
+    for path in sorted((ROOT / "pipelines" / "export" / "page").iterdir()):
         if path.suffix != ".css":
             yield str(path.relative_to(ROOT)), "\n".join(re.findall(r">[^<>{}]+<|\"[^\"]* [^\"]*\"", path.read_text()))
 

@@ -2,19 +2,21 @@
 
 import csv
 import io
-from pathlib import Path
 
 import numpy as np
 
 from msgs_slam.formats.atomic import write_text
-from msgs_slam.pipelines.outcome import Outcome, map_cloud
+from msgs_slam.pipelines.export.scene import ExportScene
+from msgs_slam.pipelines.outcome import map_cloud
+from msgs_slam.pipelines.run.target import Target
 
 
-def write_class_boxes(outcome: Outcome, folder: Path) -> list[Path]:
-    """class_boxes.csv: name, Gaussians, and lowest and highest x, y, z of nine tenths of them.
+def write_class_boxes(scene: ExportScene, target: Target) -> None:
+    """Write boxes.csv: name, Gaussians, and lowest and highest x, y, z of nine tenths of them.
 
-    `outcome` stands in the world of the exported files already; a class without Gaussians has no row.
+    A class without Gaussians has no row.
     """
+    outcome = scene.outcome
     cloud = map_cloud(outcome)
     rows = [["class", "gaussians", "x0", "y0", "z0", "x1", "y1", "z1"]]
     for label, name in enumerate(outcome.classes.names):
@@ -24,5 +26,4 @@ def write_class_boxes(outcome: Outcome, folder: Path) -> list[Path]:
             rows.append([name, str(len(mine)), *(f"{v:.3f}" for v in (*low, *high))])
     table = io.StringIO()
     csv.writer(table, lineterminator="\n").writerows(rows)
-    write_text(folder / "class_boxes.csv", table.getvalue())
-    return [folder / "class_boxes.csv"]
+    write_text(target.path("boxes.csv"), table.getvalue())

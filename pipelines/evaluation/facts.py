@@ -7,11 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..export.stage import on_earth
 from ..geometry.camera import rig_of
 from ..geometry.sparse_model import SparseModel
 from ..outcome import Outcome
-from ..scene.world import WORLD
+from ..scene.world import WORLD, in_world
 from ..types import Array, LoopEdge, Metres
 
 _ENDS = (0.01, 0.99)
@@ -176,7 +175,7 @@ def found_lengths(outcome: Outcome) -> list[tuple[str, str]]:
     is up, and nothing before the export."""
     if outcome.move is not None or "export" not in outcome.records or (world := outcome.run.find(WORLD)) is None:
         return []
-    shown = on_earth(outcome.moved(world.exported_from_run), world)
+    shown = in_world(outcome, world)
     rows = [("length of the path", path_length(shown))]
     if world.has_floor:
         rows.append(("camera height above the floor", camera_height(shown)))

@@ -17,7 +17,7 @@ from ...formats.errors import InputError, install_extra
 from ...formats.images import write_rgb
 from ...formats.textfile import number, read_json_object
 from ...formats.video_writer import CODECS, PLAYED, write_browser_video, write_video
-from ..export.extra.web_page import EXPORTED, RUN
+from ..export.web_page import EXPORTED, RUN
 from ..outcome import Outcome, load_outcome
 from ..run.folder import RunFolder
 from ..run.target import Target
@@ -113,10 +113,10 @@ def _write(place: Target, target: Path, pictures: Iterator[Picture], fps: float)
     with place.replacing(_belongs(target)) as staged:
         if (kind := target.suffix.lower()) not in CODECS:
             for index, picture in enumerate(pictures):
-                write_rgb(staged / f"{index:06d}.png", picture)
+                write_rgb(staged.path(f"{index:06d}.png"), picture)
         elif kind != ".mp4":
-            write_video(staged / target.name, pictures, fps)
-        elif (codec := write_browser_video(staged / target.name, pictures, fps)) not in PLAYED:
+            write_video(staged.path(target.name), pictures, fps)
+        elif (codec := write_browser_video(staged.path(target.name), pictures, fps)) not in PLAYED:
             log.warning(
                 "%s is %s, which browsers do not play: nothing here writes H.264 or VP9. %s",
                 target, codec, install_extra("hdr"),

@@ -14,17 +14,15 @@ from ...formats.mesh import read_textured_glb
 from ...formats.reading import read_bytes
 from ...formats.textfile import read_json, read_text
 from ..config import Config, config_to_dict
-from ..export.extra.web_page import WEB_PAGE
-from ..export.images import IMAGES
+from ..export.kinds import IMAGES, WEB_PAGE
 from ..export.readme import lengths
-from ..export.stage import on_earth
 from ..geometry.sparse_model import SparseModel
 from ..outcome import Outcome, load_outcome, spread_sample
 from ..read_config import config_to_toml
 from ..run.files import FIGURES, LOOPS
 from ..run.folder import RunFolder, load_source
 from ..run.target import LIST, Target
-from ..scene.world import WORLD
+from ..scene.world import WORLD, in_world
 from ..source.sharpness import at_most_wide
 from ..system.progress import Progress, SilentProgress
 from ..system.wording import figure_text, quoted
@@ -79,7 +77,7 @@ def write_report(
     outcome, target = load_outcome(run), path or run.report_file
     place = Target(target.parent, overwrite or path is None)
     with place.replacing(target.name.__eq__) as staged:
-        write_text(staged / target.name, _report(outcome, target, progress or SilentProgress()))
+        write_text(staged.path(target.name), _report(outcome, target, progress or SilentProgress()))
     return target
 
 
@@ -241,7 +239,7 @@ def _path_section(outcome: Outcome) -> str:
     """In the axes of the exported files, where there are any."""
     world = outcome.run.find(WORLD) if "export" in outcome.records and outcome.move is None else None
     if world is not None:
-        outcome = on_earth(outcome.moved(world.exported_from_run), world)
+        outcome = in_world(outcome, world)
     upright = world is not None and world.axes == "up"
     return section("Camera path", '<div class="two">', *trajectory_plots(outcome, None, upright), "</div>")
 

@@ -16,8 +16,8 @@ import torch
 from ...formats.errors import InputError
 from ...formats.reading import read_bytes
 from ..config import STAGES
-from ..export.extra.web_page import PARTS, WEB_PAGE, page_of
-from ..export.stage import on_earth
+from ..export.kinds import WEB_PAGE
+from ..export.web_page import PARTS, page_of
 from ..geometry.sparse_model import SparseModel
 from ..outcome import Outcome, load_outcome, runs_of_pieces
 from ..reconstruct import require_run
@@ -27,7 +27,7 @@ from ..run.folder import RunFolder, load_records, load_settings
 from ..run.manifest import StageRecord, recorded_config
 from ..run.progress import load_run_progress
 from ..scene.upright import Upright
-from ..scene.world import WORLD, up_in_run, upright_world
+from ..scene.world import WORLD, in_world, up_in_run, upright_world
 from ..system.progress import log
 from ..system.wording import quoted
 from ..types import ClassTable, Trajectory
@@ -76,7 +76,7 @@ def page_of_run(run: RunFolder) -> str:
     if not len(outcome.require_map()):
         raise InputError(f"{run.root} has no Gaussians to show")
     if (world := outcome.run.find(WORLD) if "export" in records else None) is not None:
-        return page_of(on_earth(outcome.moved(world.exported_from_run), world), world)
+        return page_of(in_world(outcome, world), world)
     world = upright_world(outcome, Upright(up_in_run(outcome), "cameras", None))
     elements = "Gaussians" if "mapping" in records else "points"
     return page_of(outcome.moved(world.exported_from_run), world, is_exported=False, elements=elements)

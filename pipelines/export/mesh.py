@@ -6,13 +6,13 @@ Each step is a task over chunks of keyframes or of regions, and leaves files in 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ...formats.mesh import (
-    MeshBlocks,
     mesh_blocks,
     read_mesh_ply,
     write_mesh_glb,
@@ -26,15 +26,16 @@ from ..geometry.posed_depth import PosedDepth
 from ..mapping.measure import DepthViews, MeshView, mesh_view
 from ..outcome import Outcome, load_outcome, maps_around
 from ..run.stages import StageContext
+from ..run.target import Target
 from ..run.tasks import Chunk, in_chunks
-from ..scene.world import World
 from ..system.parallel import LruSequence, map_lookahead
 from ..system.progress import Progress
 from ..system.values import load_value, save_value
 from ..types import VOID
-from .extra.texture import make_textured
 from .planes import Planes, planes_of, snap_to_planes
+from .scene import ExportScene
 from .surface import Region, chunk_surfaces, closed, joined, weld
+from .texture import make_textured
 from .volume import BEHIND, Grid, fuse, make_grid
 
 TRUNCATION = 3.0
@@ -51,17 +52,19 @@ MAX_TEXTURED = 4_000_000
 the colours of its vertices do."""
 
 
-def write_meshes(context: StageContext, folder: Path, outcome: Outcome, world: World) -> list[Path]:
+def write_mesh(scene: ExportScene, target: Target) -> None:
     """Draw the map in the keyframes, snap uncertain depths to planes, fuse all region by region, join the regions, and
     write mesh.ply with all its vertices, and mesh.glb, lighter and with a texture where the settings want one.
 
-    The tasks are those of `context`, whose snapshot has what does not fit into memory; files in the folder stay.
-    `outcome` has been moved, and may be without its map. Returns the paths written.
+    Files that are there stay. The tasks load the map themselves; what does not fit into memory is in the snapshot of
+    the scene's context.
     """
-    settings, names, axes = context.config.export, outcome.classes.names, world.gltf_from_exported
-    ply, glb, scratch, count = folder / "mesh.ply", folder / "mesh.glb", _scratch(context), len(keyframe_rows(outcome))
+    context, outcome, settings = scene.context, scene.outcome, scene.settings
+    names, axes = outcome.classes.names, scene.world.gltf_from_exported
+    ply, glb = target.path("mesh.ply"), target.path("mesh.glb")
+    scratch, count = _scratch(context), len(keyframe_rows(outcome))
     if ply.exists() and glb.exists():
-        return [ply, glb]
+        return
     in_chunks(context, draw_keyframes, count, move=outcome.move)
     if settings.planes:
         in_chunks(context, snap_views, count, planes=planes_in(scratch, count))
@@ -74,14 +77,13 @@ def write_meshes(context: StageContext, folder: Path, outcome: Outcome, world: W
         write_mesh_ply(ply, joined(lambda: (load_value(_region_file(scratch, n)) for n in range(regions))), names)
     mesh = mesh_blocks(ply)
     if not mesh.face_count:
-        return [ply]
-    if mesh.face_count > MAX_TEXTURED or not settings.texture:
+        context.warn("the mesh is empty: no surface is seen by enough keyframes")
+    elif mesh.face_count > MAX_TEXTURED or not settings.texture:
         write_mesh_glb(glb, mesh, names, axes)
     else:
         textured = make_textured(outcome, read_mesh_ply(ply), DepthViews(views), context.progress)
         turned = replace(textured, vertices=(textured.vertices @ axes.T).astype(np.float32))
         write_textured_glb(glb, turned, names)
-    return [ply, glb]
 
 
 def _scratch(context: StageContext) -> Path:
@@ -195,8 +197,9 @@ def _region(
     return Region(surface, *paint(surface.vertices, painting, class_ids, 2 * grid.truncation))
 
 
-def mesh_figures(mesh: MeshBlocks) -> dict[str, int | float]:
-    """Counts for the report."""
+def mesh_figures(path: Path) -> dict[str, Any]:
+    """Count for the report what a mesh.ply holds."""
+    mesh = mesh_blocks(path)
     labelled = sum(int((labels != VOID).sum()) for _, _, labels in mesh.vertices())
     share = round(labelled / max(mesh.vertex_count, 1), 4)
     return {"vertices": mesh.vertex_count, "faces": mesh.face_count, "labelled_share": share}

@@ -30,22 +30,24 @@ from ..run.folder import RunFolder, load_records
 from ..run.manifest import piece_digest
 from ..run.runner import run_stages
 from ..run.stages import Stage, StageContext
+from ..run.target import Target
 from ..scene.world import FIRST
 from ..system.progress import WithinStage
-from .writers import write_colmap, write_trajectory
+from .colmap import write_colmap, write_trajectory
+from .scene import ExportScene
 
 
 def write_pieces(context: StageContext) -> None:
     """Make the pieces, and write piece_2 and so on: each with all the files of an export, or with its poses."""
-    side = context.config.export.image_side
     for piece in make_pieces(context):
         if "export" in (records := load_records(piece)):
             for name in records["export"].files:
                 copy_file(piece.file("export", name), context.folder / piece.root.name / name)
         elif "tracking" in records:
-            found = load_outcome(piece, context.device)
-            write_colmap(found, FIRST, side, context.folder / piece.root.name, context.warn)
-            write_trajectory(found, context.folder / piece.root.name)
+            scene = ExportScene(load_outcome(piece, context.device), FIRST, context)
+            target = Target(context.folder / piece.root.name)
+            write_colmap(scene, target)
+            write_trajectory(scene, target)
 
 
 def make_pieces(context: StageContext) -> list[RunFolder]:

@@ -2,7 +2,7 @@
 
     1. its record, with the checksums of all results, is written into the unfinished folder: from here on it is finished
     2. snapshot and notes of what was read are removed
-    3. the folder of an earlier result is renamed aside and removed; what others have put into the export's is kept
+    3. the folder of an earlier result is renamed aside and removed; what others put there goes to exports/
     4. the unfinished folder takes the name of the stage
     5. the manifest names the stage
     6. the record in the folder is removed
@@ -16,6 +16,7 @@ import shutil
 import time
 from contextlib import suppress
 from dataclasses import asdict
+from itertools import count
 from pathlib import Path
 
 from ...formats.errors import InputError
@@ -27,7 +28,7 @@ from .folder import RunFolder
 from .manifest import StageRecord, content_digest
 from .reads import LOGS, Situation
 from .schema import dataclass_from_json
-from .target import LIST, keep_others
+from .target import LIST
 
 SNAPSHOT, RECORD = "snapshot", ".record.json"
 """In an unfinished folder: the folder of snapshots, the record of a stage that ended."""
@@ -71,19 +72,25 @@ def move_in(run: RunFolder, name: str) -> None:
     shutil.rmtree(folder / SNAPSHOT, ignore_errors=True)
     shutil.rmtree(folder / LOGS, ignore_errors=True)
     if name == STAGES[-1]:
-        _keep_others(target, folder)
+        _spare_others(run, folder)
     discard(target)
     os.replace(folder, target)
     _flush_folder(run.root)
 
 
-def _keep_others(old: Path, new: Path) -> None:
-    """What people keep beside the exported files, and exports on request, stay when the stage is made again."""
-    record = dataclass_from_json(StageRecord, read_json_object(new / RECORD, MAX_OWN_JSON_BYTES))
-    if kept := keep_others(old, new, record.files):
-        log.warning(
-            "%s stays in %s, as it was made before: msgs-slam export --only makes it again", ", ".join(kept), old
-        )
+def _spare_others(run: RunFolder, new: Path) -> None:
+    """Move what no stage has left in the export's folder into exports/, which no stage touches."""
+    old, manifest = run.stage(STAGES[-1]), run.manifest()
+    records = {**manifest.stale, **manifest.records} if manifest else {}
+    known = set(records[STAGES[-1]].files) if STAGES[-1] in records else set()
+    tops = {entry.name for entry in new.iterdir()} if not known else set()
+    others = {n for n in checksums(old) if n not in known and n.partition("/")[0] not in {*tops, LIST, RECORD}}
+    if others:
+        kept = next(path for k in count(1) if not (path := run.path("exports", f"kept_{k}")).exists())
+        for name in others:
+            (kept / name).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(old / name, kept / name)
+        log.warning("%d files in %s are not of the run: they are in %s now", len(others), old, kept)
 
 
 def unseal(run: RunFolder, name: str) -> None:

@@ -8,16 +8,14 @@ import os
 import platform
 import shutil
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
 from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 
 from ...formats.errors import InputError, RecoverableError
-from ...formats.reading import links_in, require_no_link
-from ..config import STAGES
-from .folder import RunFolder, load_records, load_stale, why_not_done
+from .folder import RunFolder, load_records
 
 LOCK, SOFT_LOCK = ".lock", ".lock.owner"
 """The second on disks without locks: whichever process can make it works on the run."""
@@ -104,31 +102,6 @@ def _open_existing(path: Path) -> IO[bytes]:
         return path.open("r+b")
     except OSError:
         return path.open("rb")
-
-
-@contextmanager
-def locked_export(run: RunFolder, folder: Path) -> Iterator[None]:
-    """Hold the run's lock in this block where `folder`, which files are written to, is the run's own export: the stage
-    would replace it meanwhile.
-
-    Raises RunBusyError where another process works on the run, InputError where that export is of an earlier result of
-    the stages before it, or holds links.
-    """
-    own = run.stage(STAGES[-1])
-    if folder.resolve() != own.resolve():
-        yield
-        return
-    elsewhere = "or write to another folder with --to DIR"
-    with ExitStack() as held:
-        try:
-            held.enter_context(locked(RunFolder(run.place.parent) if run.is_piece else run))
-        except RunBusyError as error:
-            raise RunBusyError(f"{error}, {elsewhere}") from error
-        if STAGES[-1] in load_stale(run):
-            raise InputError(f"{why_not_done(run, STAGES[-1])}, {elsewhere}: other files would be mixed with these")
-        if link := next(links_in(own), None):
-            require_no_link(link)
-        yield
 
 
 def make_folder(root: Path) -> bool:

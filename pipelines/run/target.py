@@ -11,19 +11,16 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import NamedTuple
 
 from ...formats.atomic import explained, machine_token, process_token
 from ...formats.errors import InputError
-from ...formats.reading import file_sha256
+from ...formats.reading import file_sha256, is_plain_path
 from ...formats.textfile import read_json_object, write_json
-from ..system.wording import quoted
 
 LIST = ".msgs-slam.json"
 """The list of the files that the program has written into a folder."""
-STAGE = "stage"
-"""Origin of the files that a stage has left in its folder."""
 _STAGED = ".msgs-slam-"
 _NAMED = 3
 """Names in a message."""
@@ -43,14 +40,22 @@ class Written(NamedTuple):
 
 @dataclass(frozen=True)
 class Target:
-    """A folder to write into. `overwrite`: files of others may be replaced. `origin`: what the files are made from,
-    those of another origin do not stay beside them; "": any may stay. `fixed`: files of a stage, (bytes, sha256) by
-    relative path, which may be written with the same contents only."""
+    """A folder to write into; `written` are the names of files and folders in it whose `path` was asked for.
+
+    `overwrite`: files of others may be replaced. `origin`: what the files are made from, those of another origin do not
+    stay beside them; "": any may stay.
+    """
 
     folder: Path
     overwrite: bool = False
     origin: str = ""
-    fixed: Mapping[str, tuple[int, str]] = field(default_factory=dict)
+    written: list[str] = field(default_factory=list)
+
+    def path(self, name: str) -> Path:
+        """Return the path to write a file or folder to."""
+        if name not in self.written:
+            self.written.append(name)
+        return self.folder / name
 
     def require(self, belongs: Belongs) -> None:
         """Raise InputError where an entry that belongs to what will be written is not from this program, or was changed
@@ -63,8 +68,7 @@ class Target:
             raise InputError(f"{other} is a device or a pipe, or a link to nothing: name a file that may be written")
         if self.overwrite:
             return
-        fixed = {name: Written(*stamp, STAGE) for name, stamp in self.fixed.items()}
-        if foreign := [e.name for e in entries if not all(_is_own(self.folder, f, fixed | listed) for f in _files(e))]:
+        if foreign := [e.name for e in entries if not all(_is_own(self.folder, f, listed) for f in _files(e))]:
             raise InputError(
                 f"{self.folder} holds {_joined(foreign)}, which msgs-slam has not written or which was changed since: "
                 "name another place, or add --overwrite to replace it"
@@ -76,9 +80,9 @@ class Target:
             )
 
     @contextmanager
-    def replacing(self, belongs: Belongs) -> Iterator[Path]:
-        """Yield an empty folder to write into; when the block ends well, its files are moved to their places, and what
-        an earlier call has left of the names that belong to them, or of another origin, is removed.
+    def replacing(self, belongs: Belongs) -> Iterator["Target"]:
+        """Yield the target of an empty folder to write into; when the block ends well, its files are moved to their
+        places, and what an earlier call has left of the names that belong to them, or of another origin, is removed.
 
         Raises InputError as `require` does, before the block and after it.
         """
@@ -91,7 +95,7 @@ class Target:
             raise explained(error, self.folder / LIST) from error
         try:
             _remove_left(self.folder)
-            yield staged
+            yield Target(staged)
             fresh = {entry.name for entry in staged.iterdir()}
             self.require(lambda name: belongs(name) or name in fresh)
             self._move_in(staged, belongs)
@@ -109,31 +113,25 @@ class Target:
         ]
 
     def _move_in(self, staged: Path, belongs: Belongs) -> None:
-        fresh = {p.relative_to(staged).as_posix(): _stamp(p) for p in sorted(_files(staged))}
-        for name, stamp in fresh.items():
-            if self.fixed.get(name, stamp) != stamp:
-                raise InputError(
-                    f"{self.folder / name} belongs to the run, and these settings or this version of the program write "
-                    f"it otherwise: run `msgs-slam resume {quoted(self.folder.parent)} --redo export`, or name another "
-                    "folder with --to"
-                )
-            if (self.folder / name).is_dir():
-                raise InputError(f"{self.folder / name} is a folder: name another place")
+        fresh = [p.relative_to(staged).as_posix() for p in sorted(_files(staged))]
+        if folder := next((self.folder / name for name in fresh if (self.folder / name).is_dir()), None):
+            raise InputError(f"{folder} is a folder: name another place")
         listed = read_list(self.folder)
-        stale = [n for n in listed if belongs(_top(n)) and n not in fresh and n not in self.fixed]
+        stale = [name for name in listed if belongs(_top(name)) and name not in fresh]
         for name in stale + self._of_another_origin(listed, belongs):
             if _is_own(self.folder, self.folder / name, listed):
                 _remove(self.folder, name)
             del listed[name]
         try:
-            for name, stamp in fresh.items():
+            for name in fresh:
                 (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
+                listed[name] = Written((staged / name).stat().st_size, file_sha256(staged / name), self.origin)
                 os.replace(staged / name, self.folder / name)
-                listed[name] = Written(*stamp, STAGE if name in self.fixed else self.origin)
         except OSError as error:
             raise explained(error, self.folder / name) from error
         finally:
-            write_list(self.folder, listed)
+            about = "Files that msgs-slam has written here: bytes, SHA-256 and origin. It replaces only these."
+            write_json(self.folder / LIST, {"about": about, "files": dict(sorted(listed.items()))})
 
 
 def read_list(folder: Path) -> dict[str, Written]:
@@ -142,36 +140,10 @@ def read_list(folder: Path) -> dict[str, Written]:
     try:
         files = read_json_object(folder / LIST)["files"]
         return {
-            n: Written(int(size), str(sha), str(origin)) for n, (size, sha, origin) in files.items() if _is_below(n)
+            n: Written(int(size), str(sha), str(origin)) for n, (size, sha, origin) in files.items() if is_plain_path(n)
         }
     except (InputError, KeyError, TypeError, ValueError, AttributeError):
         return {}
-
-
-def write_list(folder: Path, files: Mapping[str, Written]) -> None:
-    """Write the list of the files that the program has written into a folder."""
-    about = "Files that msgs-slam has written into this folder: bytes, SHA-256 and origin. It replaces only these."
-    write_json(folder / LIST, {"about": about, "files": dict(sorted(files.items()))})
-
-
-def keep_others(old: Path, new: Path, written: Mapping[str, tuple[int, str]]) -> list[str]:
-    """Move what does not come from the stage out of its earlier folder `old` into `new`, which takes the place of that
-    and holds the files `written`, and list the files in `new`.
-
-    Returns the names of what the program has written there on request: it still shows the earlier map.
-    """
-    listed, tops = read_list(old), {_top(name) for name in written}
-    for path in [file for entry in _entries(old) for file in _files(entry)]:
-        name = path.relative_to(old).as_posix()
-        of_stage = name in written or (
-            _is_own(old, path, listed) and listed[name].origin == STAGE if listed else _top(name) in tops
-        )  # without a list it was written by an earlier version
-        if not of_stage and not name.startswith(_STAGED) and name != LIST:
-            (new / name).parent.mkdir(parents=True, exist_ok=True)
-            os.replace(path, new / name)
-    kept = {n: w for n, w in listed.items() if w.origin != STAGE and n not in written and (new / n).is_file()}
-    write_list(new, kept | {name: Written(*stamp, STAGE) for name, stamp in written.items()})
-    return sorted({_top(name) for name in kept})
 
 
 def _entries(folder: Path) -> list[Path]:
@@ -189,15 +161,6 @@ def _files(entry: Path) -> Iterator[Path]:
 
 def _top(name: str) -> str:
     return name.partition("/")[0]
-
-
-def _is_below(name: str) -> bool:
-    path = PurePosixPath(name)
-    return not path.is_absolute() and ".." not in path.parts and path.as_posix() == name
-
-
-def _stamp(path: Path) -> tuple[int, str]:
-    return path.stat().st_size, file_sha256(path)
 
 
 def _is_own(folder: Path, path: Path, listed: Mapping[str, Written]) -> bool:

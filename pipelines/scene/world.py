@@ -1,6 +1,6 @@
 """The world of the exported files, and the transform from the run's own to it."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +59,15 @@ class World:
 
 
 FIRST = World("first", "", False, SAME)
+
+
+def in_world(outcome: Outcome, world: World) -> Outcome:
+    """Return the outcome as the exported files show it. On the Earth they are in metres: there is nothing to multiply.
+
+    Raises ValueError for one that has been moved before.
+    """
+    moved = outcome.moved(world.exported_from_run)
+    return moved if world.earth is None else replace(moved, metric=True, metres=None)
 
 
 def upright_world(outcome: Outcome, found: Upright) -> World:

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import Sequence, open_sequence
 from msgs_slam.pipelines.evaluation.truth import match_truth
-from msgs_slam.pipelines.export.extra.floor_plan import walls_of_run
-from msgs_slam.pipelines.export.extra.walls import Wall, find_walls
+from msgs_slam.pipelines.export.floor_plan import Wall, find_walls, walls_of_run
 from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder

@@ -17,8 +17,9 @@ from PIL import Image
 from msgs_slam.formats.atomic import temporary_of
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.video_writer import write_video
-from msgs_slam.msgs_cli.main import KindOfFile, main
-from msgs_slam.pipelines.config import EXPORTS, Config
+from msgs_slam.msgs_cli.main import main
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.export.kinds import export_of
 from msgs_slam.pipelines.reconstruct import existing_config
 from msgs_slam.pipelines.run.folder import RunFolder, save_settings
 from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
@@ -108,7 +109,7 @@ def test_a_folder_of_videos_is_for_batch(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("word", "kind"), [("texture", "mesh"), ("GLTF", "glb"), ("poses", "tum"), ("ply", "ply")])
 def test_kinds_of_files_by_the_names_of_their_formats(word: str, kind: str) -> None:
-    assert KindOfFile(EXPORTS).convert(word, None, None) == kind
+    assert export_of(word).kind == kind
     assert invoke("export", "no_such_run", "--only", word).exit_code == 1, "no wrong usage"
 
 

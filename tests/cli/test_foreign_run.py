@@ -67,7 +67,7 @@ def linked(name: str, *hops: str) -> Callable[[Path, Path], None]:
         for hop in hops:
             (run / hop).symlink_to(target)
             target = run / hop
-        (run / name).parent.mkdir(exist_ok=True)
+        (run / name).parent.mkdir(parents=True, exist_ok=True)
         (run / name).symlink_to(target)
 
     return spoil
@@ -110,13 +110,14 @@ ESCAPES: dict[str, tuple[Spoil, tuple[tuple[str, ...], ...]]] = {
     "a chain of links": (linked("frames/000000.jpg", "frames/hop", "frames/hop2"), (COLMAP,)),
     "a linked folder of a stage": (linked("global_ba"), (COLMAP, RENDER, REPORT, EXTEND, RESUME)),
     "a linked folder in a stage": (linked("frames/correspondence"), (EXTEND,)),
-    "a linked export": (linked("export"), (OWN, RESUME, REPORT)),
-    "a linked folder of the export": (linked("export/sparse"), (OWN,)),
+    "a linked export": (linked("export"), (RESUME, REPORT)),
+    "a linked folder of exports": (linked("exports"), (OWN,)),
+    "a linked folder of an export": (linked("exports/colmap/sparse"), (OWN,)),
     "a linked unfinished stage": (linked("export.partial"), (("resume", "{run}", "--redo", "export"),)),
     "a linked evaluation": (linked("evaluation"), (EVALUATE, REPORT)),
     "linked settings": (linked("run.toml"), (COLMAP, RESUME)),
     "a linked manifest": (linked("manifest.json"), (COLMAP, RESUME)),
-    "a linked lock": (linked_lock, (RESUME, OWN)),
+    "a linked lock": (linked_lock, (RESUME,)),
     "a name in the manifest": (named_in_the_manifest, (RESUME, COLMAP)),
     "a linked piece": (linked_piece, (RESUME,)),
 }

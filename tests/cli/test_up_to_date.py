@@ -14,7 +14,6 @@ from msgs_slam.pipelines.evaluation.serve import page_of_run
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run import stages
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_source
-from msgs_slam.pipelines.run.lock import locked
 from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
 from msgs_slam.pipelines.source.recording import open_recording
 from tests.pipelines.finished import note_finished
@@ -143,27 +142,16 @@ def test_what_was_made_before_a_change_stays_and_counts_again(
     assert "map.html" not in (run / "report.html").read_text()
     (run / "report.html").unlink()
     # The new map's files beside the old map's would not be told apart.
-    refused = " ".join(invoke("export", run, "--only", "ply").stderr.split())
-    assert "or write to another folder with --to DIR: other files would be mixed with these" in refused
-    assert invoke("export", run, "--only", "tum", "--to", tmp_path / "out", "-q").exit_code == 0
-    back = refused.split("go back with `")[1].split("`")[0]
+    refused = " ".join(invoke("export", run, "--only", "ply", "--to", run / "export").stderr.split())
+    assert "belongs to the run" in refused
+    assert invoke("export", run, "--only", "tum", "-q").exit_code == 0
+    assert (run / "exports" / "tum" / "trajectory.txt").is_file()
+    said = " ".join(invoke("status", run).stdout.split())
+    back = said.split("go back with `")[1].split("`")[0]
     gone_back = invoke(*shlex.split(back)[1:], "-v")
     assert gone_back.exit_code == 0, gone_back.output
     assert gone_back.stderr.count("] up to date") == 5
     assert {k for k, v in before.items() if contents(run).get(k) != v} == {str(run / "manifest.json")}
-
-
-def test_an_export_waits_for_who_works_on_the_run(copied_run: Callable[[str], Path], tmp_path: Path) -> None:
-    """The stage would replace the folder, with what is being written to it."""
-    run = copied_run("run.msgs")
-    before = contents(run)
-    with locked(RunFolder(run)):
-        refused = invoke("export", run, "--only", "tum")
-        assert refused.exit_code == 1
-        assert "another msgs-slam process is working on this run" in " ".join(refused.stderr.split())
-        assert contents(run) == before
-        assert invoke("export", run, "--only", "tum", "--to", tmp_path / "out", "-q").exit_code == 0
-    assert invoke("export", run, "--only", "tum", "-q").exit_code == 0
 
 
 def test_another_format_is_not_called_another_source(finished_run: FinishedRun, tmp_path: Path) -> None:

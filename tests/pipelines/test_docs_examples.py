@@ -12,10 +12,15 @@ from scipy.spatial.transform import Rotation
 from msgs_slam.formats.datasets import Sequence, opening
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.export.scene import ExportScene
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.proxy import selection
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
+from msgs_slam.pipelines.run.target import Target
+from msgs_slam.pipelines.scene.world import FIRST
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, Frame
 from tests.pipelines.proxy.proxy_room import UNIT, Room, perfect_backbone
@@ -87,8 +92,9 @@ def test_export(oracle_run: OracleRun, tmp_path: Path) -> None:
     from class_boxes import write_class_boxes
 
     outcome = load_outcome(oracle_run(pixel_stride=8))
-    (path,) = write_class_boxes(outcome, tmp_path)
-    with path.open() as file:
+    context = StageContext(outcome.run, tmp_path, Config(), tmp_path, SilentProgress())
+    write_class_boxes(ExportScene(outcome, FIRST, context), Target(tmp_path))
+    with (tmp_path / "boxes.csv").open() as file:
         rows = {row["class"]: [float(row[k]) for k in ("z0", "z1", "gaussians")] for row in csv.DictReader(file)}
     assert set(rows) <= set(outcome.classes.names)
     assert sum(r[2] for r in rows.values()) == len(outcome.require_map())

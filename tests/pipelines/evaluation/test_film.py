@@ -29,7 +29,7 @@ from msgs_slam.pipelines.evaluation.film import (
     smoothed,
 )
 from msgs_slam.pipelines.evaluation.metrics import psnr
-from msgs_slam.pipelines.export.extra.web_page import EXPORTED, RUN
+from msgs_slam.pipelines.export.web_page import EXPORTED, RUN
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder, load_records

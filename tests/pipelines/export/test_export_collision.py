@@ -10,7 +10,7 @@ from finished import note_finished
 from numpy.typing import NDArray
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.export.extra.meshes import MAX_FACES, with_floor
+from msgs_slam.pipelines.export.meshes import MAX_FACES, with_floor
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import SAME, WORLD, World

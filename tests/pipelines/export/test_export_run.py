@@ -1,5 +1,6 @@
 """The exported files of a run, read by other programs' libraries."""
 
+import inspect
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,18 +18,19 @@ from finished import note_finished
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.pipelines.config import EXPORTS, ExportConfig
-from msgs_slam.pipelines.export import stage
-from msgs_slam.pipelines.export.extra import texture as textured
+from msgs_slam.pipelines.config import ExportConfig
+from msgs_slam.pipelines.export import texture as textured
+from msgs_slam.pipelines.export.kinds import EXPORTS, Export, export_of, files_table, kinds_help
 from msgs_slam.pipelines.export.readme import licences
-from msgs_slam.pipelines.export.stage import export_run, find_world
+from msgs_slam.pipelines.export.scene import ExportScene, find_world
+from msgs_slam.pipelines.export.stage import export_folder, export_run
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.files import FRAMES, LEFT_OUT, METRES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.lock import RunBusyError, locked
-from msgs_slam.pipelines.run.target import LIST
+from msgs_slam.pipelines.run.lock import locked
+from msgs_slam.pipelines.run.target import LIST, Target
 from msgs_slam.pipelines.scene.world import WORLD
 from msgs_slam.pipelines.types import Metres
 from tests.splat_readers import read_gaussian_glb, read_spz
@@ -153,7 +155,7 @@ def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
         "tiles": "tiles/tileset.json",
         "tum": "trajectory.txt",
     }
-    for only in set(EXPORTS) - {"mesh", "collision", "usd", "floorplan"}:
+    for only in [row.kind for row in EXPORTS if row.needs == "map" and row.kind != "mesh"]:
         export_run(run, tmp_path / only, only, settings=ExportConfig(axes="first"))
         assert (tmp_path / only / expected[only]).exists()
         notes = (tmp_path / only / "README.txt").read_text()
@@ -203,7 +205,7 @@ def test_a_home_folder_in_a_setting_is_found(run: RunFolder, tmp_path: Path, mon
     assert "only 2 of its fixes" in result.output
 
 
-def test_free_scale_holds_in_every_file(oracle_run: OracleRun, tmp_path: Path) -> None:
+def test_free_scale_holds_in_every_file(oracle_run: OracleRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A guess of the metres is in no file of an export that leaves the unit open."""
     run = oracle_run(metric=False, mesh=True)
     world, _ = find_world(load_outcome(run), ExportConfig())
@@ -211,40 +213,44 @@ def test_free_scale_holds_in_every_file(oracle_run: OracleRun, tmp_path: Path) -
     METRES.save(run.stage("export"), Metres(3.7, 0.25, True, ("1 door",)))
     note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
     seen = []
-
-    def see(*arguments: object) -> list[Path]:
-        outcome = next(value for value in arguments if isinstance(value, Outcome))
-        seen.append((outcome.metres, outcome.move is not None))
-        return []
-
-    with pytest.MonkeyPatch.context() as patch:
-        writers = [n for n in vars(stage) if n.startswith("write_") and n not in ("write_pieces", "write_readme")]
-        for name in set(writers) - {"write_all_but_mesh", "write_meshes", "write_notes", "write_world"}:
-            patch.setattr(stage, name, see)
-        for kind in set(EXPORTS) - {"mesh"}:
-            patch.setattr(stage, "write_world", lambda outcome, world, folder: WORLD.save(folder, world))
-            export_run(run, tmp_path / kind, kind, settings=ExportConfig(scale="free"))
-    assert seen == [(None, True)] * (len(EXPORTS) - 1)
+    monkeypatch.setattr(Export, "writer", lambda row: lambda scene, target: seen.append(scene.outcome))
+    for row in EXPORTS:
+        export_run(run, tmp_path / row.kind, row.kind, settings=ExportConfig(scale="free"))
+    assert [(outcome.metres, outcome.move is not None) for outcome in seen] == [(None, True)] * len(EXPORTS)
 
 
-def test_what_others_keep_in_the_run_s_export_is_kept(oracle_run: OracleRun) -> None:
-    """Files of the user, and of exports on request, beside those of the stage, of which none changes."""
+def test_each_kind_is_one_row(tmp_path: Path) -> None:
+    """Its writer takes a scene and a target; help, the page of files and refusals name it."""
+    page = (Path(__file__).parents[3] / "docs" / "files.md").read_text(encoding="utf-8")
+    assert files_table() in page
+    said = CliRunner().invoke(main, ["export", "--help"]).output
+    names = [name for row in EXPORTS for name in (row.kind, *row.also)]
+    assert len(set(names)) == len(names)
+    for row, line in zip(EXPORTS, kinds_help().splitlines(), strict=True):
+        annotations = inspect.signature(row.writer()).parameters.values()
+        assert [p.annotation for p in annotations] in ([ExportScene, Target], ["ExportScene", "Target"])
+        assert " ".join(line.split()) in " ".join(said.split())
+        assert all(hasattr(ExportConfig(), key) for key in row.settings)
+    with pytest.raises(ValueError, match="'obj' is no kind of export: html, colmap"):
+        export_of("obj")
+
+
+def test_what_is_asked_for_has_a_folder_that_no_stage_touches(oracle_run: OracleRun, tmp_path: Path) -> None:
     run = oracle_run(video=True)
-    own = run.stage("export")
-    export_run(run, own, "tum")
-    note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
-    (own / "notes.txt").write_text("mine")
-    (own / "trajectory.txt").write_text("edited")
+    folder = export_folder(run, "poses")
+    assert folder == run.root / "exports" / "tum"
+    assert folder / "trajectory.txt" in export_run(run, only="tum")
+    (folder / "notes.txt").write_text("mine")
+    (folder / "trajectory.txt").write_text("edited")
     with pytest.raises(InputError, match=r"holds trajectory\.txt, .*--overwrite"):
-        export_run(run, own, "tum")
-    export_run(run, own, "tum", overwrite=True)
-    assert run.damaged("export") == []
-    with pytest.raises(InputError, match="--redo export"):
-        export_run(run, own, "tum", settings=ExportConfig(axes="first"), overwrite=True)
-    assert run.damaged("export") == []
-    with locked(run), pytest.raises(RunBusyError):
-        export_run(RunFolder(run.root), own, "tum")
-    assert (own / "notes.txt").read_text() == "mine"
+        export_run(run, only="tum")
+    export_run(run, only="tum", overwrite=True)
+    assert (folder / "notes.txt").read_text() == "mine"
+    for own in (run.root, run.stage("export"), run.stage("export") / "more", run.stage("frames")):
+        with pytest.raises(InputError, match="belongs to the run"):
+            export_run(run, own, "tum")
+    with locked(run):
+        export_run(RunFolder(run.root), only="tum", settings=ExportConfig(axes="first"))
 
 
 def test_a_run_without_a_map_is_refused(oracle_run: OracleRun, tmp_path: Path) -> None:

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from msgs_slam.formats.mesh import MeshArrays
 from msgs_slam.pipelines.compute.raster import draw_faces
 from msgs_slam.pipelines.compute.threads import get_threads, set_threads
-from msgs_slam.pipelines.export.extra import texture
-from msgs_slam.pipelines.export.extra.atlas import Atlas, owners, simplified, unwrapped
-from msgs_slam.pipelines.export.extra.holes import filled
-from msgs_slam.pipelines.export.extra.texture import Shot, paint_texture, texels_wanted
+from msgs_slam.pipelines.export import texture
+from msgs_slam.pipelines.export.surface import filled
+from msgs_slam.pipelines.export.texture import Atlas, Shot, owners, paint_texture, simplified, texels_wanted, unwrapped
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Intrinsics

@@ -15,13 +15,17 @@ import torch
 from msgs_slam.formats import atomic
 from msgs_slam.formats.errors import DiskFullError
 from msgs_slam.formats.gaussians import GaussianCloud
-from msgs_slam.pipelines.config import ExportConfig
-from msgs_slam.pipelines.export.extra import tiles
+from msgs_slam.pipelines.config import Config, ExportConfig
+from msgs_slam.pipelines.export import tiles
+from msgs_slam.pipelines.export.scene import ExportScene
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.render.api import render
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
+from msgs_slam.pipelines.run.target import Target
 from msgs_slam.pipelines.scene.world import SAME, Georeference, World
+from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.splat_readers import read_gaussian_glb
 
 OracleRun = Callable[..., RunFolder]
@@ -112,7 +116,10 @@ def test_it_lies_on_the_earth(oracle_run: OracleRun, tmp_path: Path) -> None:
     origin = (55.698, 13.195, 37.0)
     world = World("up", "floor", True, SAME, {}, Georeference(origin, 1.0, 9, 9, 0.01))
     outcome = load_outcome(oracle_run())
-    tiles.write_tiles(outcome, world, tmp_path)
+    tiles.write_tiles(
+        ExportScene(outcome, world, StageContext(outcome.run, tmp_path, Config(), tmp_path, SilentProgress())),
+        Target(tmp_path),
+    )
     root = json.loads((tmp_path / "tiles" / "tileset.json").read_text())["root"]
     transform = np.array(root["transform"]).reshape(4, 4, order="F")
     earth = pycolmap.GPSTransform()

@@ -16,7 +16,7 @@ from finished import note_finished
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.pipelines.config import Config, FramesConfig
-from msgs_slam.pipelines.export import writers
+from msgs_slam.pipelines.export import colmap
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.sparse_model import FrameObservations, SparseModel
@@ -58,7 +58,7 @@ def test_every_image_has_points_and_there_are_enough_to_start_from(
     run = oracle_run()
     sparse = with_points(run)
     note_finished(run, STAGES[:4], source="gone.mp4")
-    monkeypatch.setattr(writers, "_START_POINTS", 3000)
+    monkeypatch.setattr(colmap, "_START_POINTS", 3000)
     export_run(run, tmp_path, "colmap")
     model, outcome = pycolmap.Reconstruction(tmp_path / "sparse" / "0"), load_outcome(run)
     between = [f.name for f, key in zip(outcome.frames, outcome.trajectory.is_keyframe, strict=True) if not key]

@@ -19,14 +19,18 @@ from scipy.spatial.transform import Rotation
 from msgs_slam.formats.datasets import Sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb
-from msgs_slam.pipelines.config import ExportConfig
+from msgs_slam.pipelines.config import Config, ExportConfig
 from msgs_slam.pipelines.evaluation.metrics import psnr
 from msgs_slam.pipelines.evaluation.views import view_map
-from msgs_slam.pipelines.export.extra import web_page
+from msgs_slam.pipelines.export import web_page
+from msgs_slam.pipelines.export.scene import ExportScene
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.outcome import Outcome, load_outcome, map_cloud
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
+from msgs_slam.pipelines.run.target import Target
 from msgs_slam.pipelines.scene.world import FIRST, WORLD
+from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.browser import browser, in_node
 
 OracleRun = Callable[..., RunFolder]
@@ -85,8 +89,11 @@ def test_names_cannot_become_a_part_of_the_page(oracle_run: OracleRun, tmp_path:
     classes = replace(outcome.classes, names=(bad, *outcome.classes.names[1:]))
     folder = tmp_path / "run"
     outcome = replace(outcome, classes=classes, run=RunFolder(folder / "<b>{{map}}.msgs"))
-    path = web_page.write_web_page(outcome, FIRST, tmp_path)[0]
-    text = path.read_text(encoding="utf-8")
+    web_page.write_web_page(
+        ExportScene(outcome, FIRST, StageContext(outcome.run, tmp_path, Config(), tmp_path, SilentProgress())),
+        Target(tmp_path),
+    )
+    text = (tmp_path / "map.html").read_text(encoding="utf-8")
     assert "alert(1)</script>" not in text
     assert json.loads(part(text, "about"))["classes"][0]["name"] == bad
     assert "<title>&lt;b&gt;{{map}}</title>" in text

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.images import read_rgb, to_grey, write_rgb
 from msgs_slam.pipelines.depth.fields import FINE, FieldGrid, field_scales
-from msgs_slam.pipelines.export.extra.texture import _seen
+from msgs_slam.pipelines.export.texture import _seen
 from msgs_slam.pipelines.frames.keyframes import choose_keyframes
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth

@@ -13,12 +13,13 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.trajectory import read_tum
 from msgs_slam.pipelines.config import Config, FramesConfig, GlobalBaConfig
 from msgs_slam.pipelines.evaluation.truth import absolute_error
-from msgs_slam.pipelines.export.writers import write_trajectory
+from msgs_slam.pipelines.export.colmap import write_trajectory
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.between import Placer, pose_every_frame
 from msgs_slam.pipelines.run.files import BACKBONE, EVERY_FRAME, FRAMES, LEFT_OUT, save_frames
 from msgs_slam.pipelines.run.stages import StageContext
+from msgs_slam.pipelines.run.target import Target
 from msgs_slam.pipelines.types import Trajectory
 from tests.pipelines.global_ba.test_global_ba_stage import BreakOff
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames
@@ -82,7 +83,8 @@ def test_every_image_is_posed_as_well_as_the_picked_ones_and_written(
     # What is exported moves with the world, and lost images are left out of it.
     lost = replace(every, lost_reasons=("lost", *every.lost_reasons[1:]), is_keyframe=np.zeros(24, bool))
     moved = lost.moved(Similarity(2.0, np.eye(3), np.array([1.0, 2.0, 3.0])).apply_to_poses)
-    write_trajectory(SimpleNamespace(trajectory=trajectory, every=moved, metres=None, metric=True), tmp_path)
+    outcome = SimpleNamespace(trajectory=trajectory, every=moved, metres=None, metric=True)
+    write_trajectory(SimpleNamespace(outcome=outcome), Target(tmp_path))
     times, poses = read_tum(tmp_path / "trajectory.txt")
     np.testing.assert_allclose(times, np.arange(1, 24) / 30, atol=1e-8)
     np.testing.assert_allclose(poses[:, :3, 3], 2 * every.centers[1:] + [1, 2, 3], atol=1e-6)

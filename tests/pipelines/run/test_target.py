@@ -12,16 +12,16 @@ from msgs_slam.formats.reading import file_sha256
 from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.run.ending import move_in, results, seal, unseal
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.manifest import StageRecord
+from msgs_slam.pipelines.run.manifest import Manifest, Source, StageRecord, write_manifest
 from msgs_slam.pipelines.run.reads import Reads
-from msgs_slam.pipelines.run.target import LIST, STAGE, Target, Written, keep_others, read_list, write_list
+from msgs_slam.pipelines.run.target import LIST, Target, read_list
 
 
 def fill(target: Target, *names: str, text: str = "ours", belongs: Callable[[str], bool] | None = None) -> None:
     tops = {name.partition("/")[0] for name in names}
     with target.replacing(belongs or tops.__contains__) as staged:
         for name in names:
-            write_text(staged / name, text)
+            write_text(staged.path(name), text)
 
 
 def below(folder: Path) -> dict[str, str]:
@@ -61,7 +61,7 @@ def test_files_of_others_are_in_the_way_until_they_may_be_overwritten(tmp_path: 
 def test_what_appears_while_it_is_made_is_kept(tmp_path: Path) -> None:
     def make() -> None:
         with Target(tmp_path).replacing("film.mp4".__eq__) as staged:
-            write_text(staged / "film.mp4", "ours")
+            write_text(staged.path("film.mp4"), "ours")
             (tmp_path / "film.mp4").write_text("of another program")
 
     with pytest.raises(InputError, match="--overwrite"):
@@ -79,12 +79,12 @@ def test_what_was_not_announced_is_kept_too(tmp_path: Path) -> None:
 def test_two_at_once_do_not_meet_and_one_that_fails_leaves_nothing(tmp_path: Path) -> None:
     folder = tmp_path / "out"
     with Target(folder).replacing("a".__eq__) as first, Target(folder).replacing("b".__eq__) as second:
-        write_text(first / "a", "1")
-        write_text(second / "b", "2")
+        write_text(first.path("a"), "1")
+        write_text(second.path("b"), "2")
     assert below(folder) == {"a": "1", "b": "2"}
     assert set(read_list(folder)) == {"a", "b"}
     with pytest.raises(ZeroDivisionError), Target(tmp_path / "new").replacing("a".__eq__) as staged:
-        write_text(staged / "a", str(1 / 0))
+        write_text(staged.path("a"), str(1 / 0))
     assert not (tmp_path / "new").exists()
 
 
@@ -107,16 +107,6 @@ def test_files_of_another_map_do_not_stay_beside_those_of_this_one(tmp_path: Pat
     assert below(tmp_path) == {"floorplan.svg": "two", "world.json": "two"}
 
 
-def test_files_of_a_stage_are_written_with_the_same_bytes_only(tmp_path: Path) -> None:
-    write_text(tmp_path / "mesh.ply", "ours")
-    fixed = stamps(tmp_path)
-    with pytest.raises(InputError, match="--redo export"):
-        fill(Target(tmp_path, fixed=fixed), "mesh.ply", text="of other settings")
-    (tmp_path / "mesh.ply").unlink()
-    fill(Target(tmp_path, fixed=fixed), "mesh.ply", "usd")
-    assert below(tmp_path) == {"mesh.ply": "ours", "usd": "ours"}
-
-
 def test_a_list_reaches_nothing_outside_and_no_linked_folder(tmp_path: Path) -> None:
     folder, away = tmp_path / "out", tmp_path / "away"
     write_text(away / "1.png", "mine")
@@ -134,48 +124,35 @@ def test_a_list_reaches_nothing_outside_and_no_linked_folder(tmp_path: Path) -> 
         assert read_list(folder) == {}
 
 
-@pytest.mark.parametrize("has_list", [True, False])
-def test_what_others_put_beside_a_stage_stays_when_it_is_made_again(tmp_path: Path, has_list: bool) -> None:
-    old, new = tmp_path / "old", tmp_path / "new"
-    for name in ("mesh.ply", "images/1.png", "images/2.png"):
-        write_text(old / name, "stage")
-    if has_list:
-        write_list(old, {name: Written(*stamp, STAGE) for name, stamp in stamps(old).items()})
-        fill(Target(old, fixed=stamps(old)), "floorplan.svg", text="asked for")
-        write_text(old / "images" / "mine.png", "mine")
-    write_text(old / "notes" / "thesis.txt", "mine")
-    for name in ("mesh.ply", "images/1.png"):
-        write_text(new / name, "again")
-    kept = keep_others(old, new, stamps(new))
-    mine = {"notes/thesis.txt": "mine"} | (
-        {"floorplan.svg": "asked for", "images/mine.png": "mine"} if has_list else {}
-    )
-    assert below(new) == {"mesh.ply": "again", "images/1.png": "again", **mine}
-    assert kept == (["floorplan.svg"] if has_list else [])
-    Target(new).require({"mesh.ply", "floorplan.svg"}.__contains__)
-
-
-def test_the_folder_of_the_export_is_replaced_around_what_is_not_its_own(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("is_recorded", [True, False])
+def test_the_export_is_replaced_and_files_of_others_in_it_are_moved_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, is_recorded: bool
 ) -> None:
+    """The record of a stage that is made again as asked for is gone by then."""
     run = RunFolder(tmp_path / "video.msgs")
+    own, on_request = run.stage("export"), run.path("exports", "floorplan")
 
     def end_stage(*names: str) -> None:
         for name in names:
             write_text(run.partial("export") / name, " ".join(names))
-        files = results(run.partial("export"))
-        seal(run.partial("export"), StageRecord(Reads(), files, 1.0, 1.0, {}, [], ""))
+        record = StageRecord(Reads(), results(run.partial("export")), 1.0, 1.0, {}, [], "")
+        seal(run.partial("export"), record)
         move_in(run, "export")
+        if is_recorded:
+            write_manifest(run.manifest_file, Manifest(Source("video.mp4", ""), {"export": record}))
         unseal(run, "export")
 
-    end_stage("mesh.ply", "images/1.jpg", "images/2.jpg")
-    own = run.stage("export")
-    fill(Target(own, fixed=results(own)), "floorplan.svg")
+    end_stage("mesh.ply", "images/1.jpg", "images/2.jpg", "masks/1.png")
+    fill(Target(on_request), "floorplan.svg")
+    before = below(on_request)
     write_text(own / "thesis" / "chapter.txt", "mine")
     end_stage("mesh.ply", "images/1.jpg")
     again = "mesh.ply images/1.jpg"
-    assert below(own) == {
-        "mesh.ply": again, "images/1.jpg": again, "floorplan.svg": "ours", "thesis/chapter.txt": "mine"
-    }  # fmt: skip
-    assert "floorplan.svg stays in" in caplog.text
-    assert sorted(p.name for p in run.root.iterdir()) == ["export"]
+    assert below(own) == {"mesh.ply": again, "images/1.jpg": again}
+    assert below(on_request) == before
+    assert below(run.path("exports", "kept_1"))["thesis/chapter.txt"] == "mine"
+    assert "are not of the run: they are in" in caplog.text
+    write_text(own / "thesis" / "chapter.txt", "mine too")
+    end_stage("mesh.ply", "images/1.jpg")
+    kept = [below(run.path("exports", f"kept_{n}"))["thesis/chapter.txt"] for n in (1, 2)]
+    assert kept == ["mine", "mine too"]

@@ -1,6 +1,7 @@
 """Up and the floor against the truth of the synthetic room, whose z is up; and scenes that do not tell."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -103,14 +104,13 @@ def shapeless(oracle_run: OracleRun) -> RunFolder:
     return run
 
 
-def test_a_scene_that_does_not_tell_stays_as_it_was(shapeless: RunFolder) -> None:
+def test_a_scene_that_does_not_tell_stays_as_it_was(shapeless: RunFolder, tmp_path: Path) -> None:
     outcome = load_outcome(shapeless)
     world, reasons = find_world(outcome, ExportConfig())
     assert world == FIRST
     assert "up is unknown" in reasons[0]
-    paths = export_run(shapeless, shapeless.root / "out", "tum")
-    assert shapeless.root / "out" / "world.json" in paths
-    rows = np.loadtxt(shapeless.root / "out" / "trajectory.txt")
+    assert tmp_path / "world.json" in export_run(shapeless, tmp_path, "tum")
+    rows = np.loadtxt(tmp_path / "trajectory.txt")
     np.testing.assert_allclose(rows[:, 1:4], outcome.trajectory.centers, atol=1e-6)
 
 

@@ -15,16 +15,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ....formats.atomic import require_room, write_text
-from ....formats.gaussians import GaussianCloud
-from ....formats.sog import morton_order
-from ...geometry.camera import rig_of
-from ...outcome import Outcome, map_cloud, spread_sample
-from ...run.folder import RunFolder
-from ...scene.world import SAME, Z_UP_FROM_Y_DOWN, World
-from ...types import VOID
+from ...formats.atomic import require_room, write_text
+from ...formats.gaussians import GaussianCloud
+from ...formats.sog import morton_order
+from ..geometry.camera import rig_of
+from ..outcome import Outcome, map_cloud, spread_sample
+from ..run.folder import RunFolder
+from ..run.target import Target
+from ..scene.world import SAME, Z_UP_FROM_Y_DOWN, World
+from ..types import VOID
+from .kinds import WEB_PAGE
+from .scene import ExportScene
 
-WEB_PAGE = "map.html"
 MAX_GAUSSIANS = 1_500_000
 """About 20 MB of page, what can be sent by mail; of larger maps the least visible are left out."""
 _MIN_BYTES = 10
@@ -36,14 +38,13 @@ PARTS = Path(__file__).parent / "page"
 _SCRIPTS = ("cloud.js", "draw.js", "moves.js", "tape.js", "record.js", "page.js")
 
 
-def write_web_page(outcome: Outcome, world: World, folder: Path) -> list[Path]:
-    """Write map.html; nothing where there are no Gaussians. `outcome` is in `world`. Raises DiskFullError before it is
-    made where there is no room for it."""
-    require_room(folder / WEB_PAGE, _MIN_BYTES * min(len(outcome.require_map()), MAX_GAUSSIANS))
-    if len(outcome.require_map()) == 0:
-        return []
-    write_text(folder / WEB_PAGE, page_of(outcome, world))
-    return [folder / WEB_PAGE]
+def write_web_page(scene: ExportScene, target: Target) -> None:
+    """Write map.html; nothing where there are no Gaussians. Raises DiskFullError before it is made where there is no
+    room for it."""
+    count = len(scene.outcome.require_map())
+    require_room(target.folder / WEB_PAGE, _MIN_BYTES * min(count, MAX_GAUSSIANS))
+    if count:
+        write_text(target.path(WEB_PAGE), page_of(scene.outcome, scene.world))
 
 
 def page_of(outcome: Outcome, world: World, is_exported: bool = True, elements: str = "Gaussians") -> str:

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ....formats.atomic import require_room
-from ....formats.gaussians import GaussianCloud, isotropic_cloud
-from ....formats.glb import COMPRESSION, EXTENSION, write_compressed_glb
-from ....formats.gps import ecef_from_enu
-from ....formats.textfile import write_json
-from ...outcome import Outcome
-from ...scene.world import Z_UP_FROM_Y_DOWN, World
-
-Array = NDArray[np.float64]
+from ...formats.atomic import require_room
+from ...formats.gaussians import GaussianCloud, isotropic_cloud
+from ...formats.glb import COMPRESSION, EXTENSION, write_compressed_glb
+from ...formats.gps import ecef_from_enu
+from ...formats.textfile import write_json
+from ..run.target import Target
+from ..scene.world import Z_UP_FROM_Y_DOWN
+from ..types import Array
+from .scene import ExportScene
 
 TILES, TILESET = "tiles", "tileset.json"
 MAX_GAUSSIANS = 50_000
@@ -36,19 +36,17 @@ _WIDEST = 0.5
 """Radius to which a merged Gaussian may grow, in sides of its cell."""
 
 
-def write_tiles(outcome: Outcome, world: World, folder: Path) -> list[Path]:
-    """tiles/tileset.json and its tiles; nothing where there are no Gaussians. `outcome` stands in `world`.
-
-    tileset.json is written last. Raises DiskFullError before anything is made where there is no room for it.
-    """
-    m = outcome.require_map()
+def write_tiles(scene: ExportScene, target: Target) -> None:
+    """Write tiles/ and in it, last, tileset.json; nothing where there are no Gaussians. Raises DiskFullError before
+    anything is made where there is no room for it."""
+    m = scene.outcome.require_map()
     if len(m) == 0:
-        return []
-    require_room(folder / TILES, _MIN_BYTES * len(m))
+        return
+    require_room(target.folder / TILES, _MIN_BYTES * len(m))
     means, log_radii, logits, colors = (x.cpu().numpy() for x in (m.means, m.log_radii, m.opacity_logits, m.colors))
-    cloud = isotropic_cloud((means @ world.image_axes_from_exported.T).astype(np.float32), log_radii, logits, colors)
-    root, _ = _write_tile(cloud, target := folder / TILES, "tile")
-    root["refine"], root["transform"] = "REPLACE", _earth_from_tiles(outcome, world).ravel(order="F").tolist()
+    turned = (means @ scene.world.image_axes_from_exported.T).astype(np.float32)
+    root, _ = _write_tile(isotropic_cloud(turned, log_radii, logits, colors), folder := target.path(TILES), "tile")
+    root["refine"], root["transform"] = "REPLACE", _earth_from_tiles(scene).ravel(order="F").tolist()
     splats = [EXTENSION, COMPRESSION]
     document = {
         "asset": {"version": "1.1", "extras": {"generator": "msgs-slam"}},
@@ -57,8 +55,7 @@ def write_tiles(outcome: Outcome, world: World, folder: Path) -> list[Path]:
         "geometricError": float(2 * np.max(root["boundingVolume"]["box"][3:])),
         "root": root,
     }
-    write_json(target / TILESET, document)
-    return [target]
+    write_json(folder / TILESET, document)
 
 
 def _write_tile(cloud: GaussianCloud, folder: Path, name: str) -> tuple[dict[str, Any], GaussianCloud]:
@@ -139,9 +136,8 @@ def _center_and_half(tile: dict[str, Any]) -> tuple[Array, Array]:
     return box[:3], box[[3, 7, 11]]
 
 
-def _earth_from_tiles(outcome: Outcome, world: World) -> Array:
+def _earth_from_tiles(scene: ExportScene) -> Array:
     """(4, 4) to the Earth's centre where GPS tells the place; else to metres, as far as they are known."""
-    if world.earth is not None:
-        return ecef_from_enu(np.array(world.earth.origin))
-    per_unit = 1.0 if outcome.metric or outcome.metres is None else outcome.metres.per_unit
-    return np.diag([per_unit, per_unit, per_unit, 1.0])
+    if scene.world.earth is not None:
+        return ecef_from_enu(np.array(scene.world.earth.origin))
+    return np.diag([*[scene.metres_per_unit] * 3, 1.0])

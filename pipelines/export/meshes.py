@@ -1,7 +1,6 @@
 """The mesh of a run for engines: collision.glb to walk in, with a floor without holes, and USDZ in true size."""
 
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,58 +8,32 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from ....formats.atomic import atomic_path, require_room
-from ....formats.errors import InputError, install_extra
-from ....formats.glb import Part, linear, material, write_primitive
-from ....formats.images import write_rgb
-from ....formats.mesh import MeshArrays, TexturedMesh, read_mesh_ply, read_textured_glb
-from ...outcome import Outcome
-from ...run.files import MESH
-from ...run.folder import RunFolder
-from ...scene.world import WORLD, World
-from .atlas import simplified
+from ...formats.atomic import atomic_path, require_room
+from ...formats.errors import InputError, install_extra
+from ...formats.glb import Part, linear, material, write_primitive
+from ...formats.images import write_rgb
+from ...formats.mesh import MeshArrays, TexturedMesh
+from ..run.target import Target
+from ..types import Array
+from .scene import ExportScene
+from .texture import simplified
 
-USD, GLB = "mesh.usdz", "mesh.glb"
+USD, COLLISION = "mesh.usdz", "collision.glb"
 _TEXTURE = "texture.jpg"
-
-COLLISION = "collision.glb"
 MAX_FACES = 20_000
 """Triangles that physics engines on the web and on phones take."""
 
 
-def mesh_of_run(run: RunFolder, world: World) -> MeshArrays:
-    """Read the mesh that a run's own export has made, and move it into `world`.
-
-    Raises InputError where there is none, or an empty one.
-    """
-    if not run.has("export", MESH):
-        raise InputError(
-            f"{run.root} has no mesh yet, and this file is made from it: finish the run with msgs-slam resume"
-        )
-    mesh = read_mesh_ply(run.file("export", MESH))
-    if len(mesh.faces) == 0:
-        raise InputError(f"{run.root}: the mesh is empty, so there is nothing to write: film the scene again")
-    if (own := run.find(WORLD)) is None:
-        return mesh
-    move = world.exported_from_run @ own.exported_from_run.inverse()
-    return replace(mesh, vertices=move.apply(mesh.vertices.astype(np.float64)).astype(np.float32))
-
-
-def write_collision(outcome: Outcome, world: World, folder: Path) -> list[Path]:
-    """Write collision.glb for files in `world`: no colours, y up.
-
-    Raises InputError where the run has no mesh, or an empty one.
-    """
-    mesh = mesh_of_run(outcome.run, world)
+def write_collision(scene: ExportScene, target: Target) -> None:
+    """Write collision.glb: no colours, y up. Raises InputError where the run has no mesh, or an empty one."""
+    mesh, world = scene.mesh(), scene.world
     light = simplified(mesh, MAX_FACES / len(mesh.faces)) if len(mesh.faces) > MAX_FACES else mesh
-    points = light.vertices.astype(np.float64)
-    faces = light.faces
+    points, faces = light.vertices.astype(np.float64), light.faces
     if world.axes == "up" and world.has_floor:
         points, faces = with_floor(points, faces)
     parts = [Part.of("POSITION", points @ world.gltf_from_exported.T), Part.of("", faces.astype(np.uint32).ravel())]
     extras = {"materials": [material(unlit=False)]}
-    write_primitive(folder / COLLISION, parts, {"mode": 4, "material": 0}, (), {"name": "collision"}, extras)
-    return [folder / COLLISION]
+    write_primitive(target.path(COLLISION), parts, {"mode": 4, "material": 0}, (), {"name": "collision"}, extras)
 
 
 def with_floor(points: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
@@ -76,9 +49,8 @@ def with_floor(points: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[N
     return np.concatenate([points, floor]), np.concatenate([faces, fan]).astype(np.int32)
 
 
-def write_usd(outcome: Outcome, world: World, folder: Path) -> list[Path]:
-    """Write mesh.usdz for files in `world`, in which `outcome` stands: y up, the texture of mesh.glb or else a colour
-    at each vertex, and the class of each vertex.
+def write_usd(scene: ExportScene, target: Target) -> None:
+    """Write mesh.usdz: y up, the texture of mesh.glb or else a colour at each vertex, and the class of each vertex.
 
     Raises InputError where usd-core is not installed, or the run has no mesh, or an empty one.
     """
@@ -86,27 +58,15 @@ def write_usd(outcome: Outcome, world: World, folder: Path) -> list[Path]:
         import pxr  # noqa: F401
     except ImportError as error:
         raise InputError(f"USD needs the package usd-core, which is not installed: {install_extra('usd')}") from error
-    mesh = _textured_of_run(outcome.run, world) or mesh_of_run(outcome.run, world)
-    per_unit = 1.0 if outcome.metric or outcome.metres is None else outcome.metres.per_unit
-    write_usdz(folder / USD, mesh, outcome.classes.names, world.gltf_from_exported, per_unit)
-    return [folder / USD]
-
-
-def _textured_of_run(run: RunFolder, world: World) -> TexturedMesh | None:
-    """The mesh with the texture that a run's own export has made, in `world`; None where it has no texture."""
-    own = run.find(WORLD)
-    if own is None or not run.has("export", GLB) or (mesh := read_textured_glb(run.file("export", GLB))) is None:
-        return None
-    move = world.exported_from_run @ own.exported_from_run.inverse()
-    vertices = move.apply(mesh.vertices.astype(np.float64) @ own.gltf_from_exported)
-    return replace(mesh, vertices=vertices.astype(np.float32))
+    mesh, names = scene.textured_mesh() or scene.mesh(), scene.outcome.classes.names
+    write_usdz(target.path(USD), mesh, names, scene.world.gltf_from_exported, scene.metres_per_unit)
 
 
 def write_usdz(
     path: Path,
     mesh: MeshArrays | TexturedMesh,
     names: tuple[str, ...],
-    turn: NDArray[np.float64],
+    turn: Array,
     metres_per_unit: float,
 ) -> None:
     """Write a package with one binary layer in it, and the texture where the mesh has one; `turn` (3, 3) makes y up.

@@ -1,0 +1,270 @@
+"""The kinds of files that an export consists of: one row each, from which the help of `export --only`, README.txt and
+the table in docs/files.md are made.
+
+To add a kind: a row here, and beside this file the function that it names. Nothing here computes.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, Literal
+
+README = "README.txt"
+IMAGES = "images"
+"""The folder of a data set's images by the name that trainers expect."""
+WEB_PAGE = "map.html"
+PIECES = "piece_"
+"""Begins the folders of disconnected components."""
+
+
+@dataclass(frozen=True)
+class ExportedFile:
+    """Files that belong together: what they are called, what they are, the programs that open them, and the first parts
+    of their paths where these differ from the name."""
+
+    name: str
+    about: str
+    opens: str = ""
+    paths: tuple[str, ...] = ()
+
+    @property
+    def tops(self) -> tuple[str, ...]:
+        """The first parts of their paths."""
+        return self.paths or (self.name.partition("/")[0],)
+
+
+@dataclass(frozen=True)
+class Export:
+    """A kind of export.
+
+    kind: its name for `export --only`, with other names that people look for; about: what it is, in a line; files: what
+    it consists of; write: "module.function" beside this file, called with (scene, target); needs: what a run must have
+    for it; settings: the keys of [export] that matter for it alone; when: whether the stage writes it.
+    """
+
+    kind: str
+    about: str
+    files: tuple[ExportedFile, ...]
+    write: str
+    needs: Literal["map", "mesh"] = "map"
+    settings: tuple[str, ...] = ()
+    when: Literal["always", "in submaps", "asked for"] = "asked for"
+    also: tuple[str, ...] = ()
+
+    def writer(self) -> Any:
+        """Import the function that writes it."""
+        module, _, function = self.write.partition(".")
+        return getattr(import_module(f".{module}", __package__), function)
+
+
+EXPORTS = (
+    Export(
+        "html", "one web page that shows the map, to send to somebody",
+        (
+            ExportedFile(
+                WEB_PAGE,
+                "the map to look at and to send: one page, 20 MB at most, that needs neither a server nor a network; "
+                "colours and classes, orbit and walk, the camera's path, a measuring tape",
+                "any browser with WebGL 2, on a computer or a phone",
+            ),
+        ),
+        "web_page.write_web_page", when="always", also=("web", "page", "map"),
+    ),
+    Export(
+        "colmap", "undistorted images and their poses as a COLMAP model and for nerfstudio",
+        (
+            ExportedFile(
+                "images/, sparse/0/",
+                "the undistorted frames with a known place, as large as the source's up to export.image_side, and "
+                "their camera (a pinhole), poses and points to start from (binary, text, points3D.ply). A frame of "
+                "which only the rotation is known is in trajectory.txt alone",
+                "COLMAP, pycolmap, gsplat (simple_trainer.py default --data_dir THIS_FOLDER --data_factor 1), the "
+                "original trainer (train.py -s THIS_FOLDER)",
+                (IMAGES, "sparse"),
+            ),
+            ExportedFile(
+                "masks/",
+                "parts left out for people, as standing still, or by --masks, where there are any: NAME.png for the "
+                "frame NAME, black is left out; transforms.json names them",
+                "COLMAP (feature_extractor --ImageReader.mask_path masks), nerfstudio",
+            ),
+            ExportedFile(
+                "transforms.json",
+                "the same data set; it names sparse/0/points3D.ply to start from",
+                "nerfstudio (ns-train splatfacto --data THIS_FOLDER), OpenSplat (opensplat THIS_FOLDER)",
+            ),
+        ),
+        "colmap.write_colmap", settings=("image_side",), when="always", also=("nerfstudio", "transforms"),
+    ),
+    Export(
+        "tum", "poses of all images of the source with their times",
+        (
+            ExportedFile(
+                "trajectory.txt",
+                "a pose for every image of the source, those between the frames of images/ too unless --pose-frames "
+                "leaves them out; TUM format: timestamp tx ty tz qx qy qz qw (camera in the world)",
+                "evo",
+            ),
+        ),
+        "colmap.write_trajectory", when="always", also=("poses", "trajectory"),
+    ),
+    Export(
+        "ply", "the map as Gaussians with classes",
+        (
+            ExportedFile(
+                "point_cloud.ply",
+                "the map: Gaussians in the layout of the original 3D Gaussian splatting; after it class_id, and "
+                "class_prob_N, the probability of class number N, for each class that occurs",
+                "SuperSplat and other splat viewers",
+            ),
+            ExportedFile(
+                "point_cloud_semantic.ply", "the same, coloured by class, with class_id and no probabilities",
+                "splat viewers",
+            ),
+        ),
+        "splats.write_ply", when="always", also=("gaussians", "splat", "point_cloud", "pointcloud"),
+    ),
+    Export(
+        "spz", "the map's colours, a tenth of the PLY's size",
+        (ExportedFile("point_cloud.spz", "the colours of the map, small (SPZ 4)", "splat viewers on the web"),),
+        "splats.write_small",
+    ),
+    Export(
+        "sog", "the map's colours, a fifteenth of the PLY's size",
+        (ExportedFile("point_cloud.sog", "the colours of the map, smaller still", "PlayCanvas, SuperSplat"),),
+        "splats.write_smallest",
+    ),
+    Export(
+        "glb", "the map as Gaussians in glTF",
+        (
+            ExportedFile(
+                "point_cloud.glb",
+                "the map in glTF (KHR_gaussian_splatting), classes as attribute _LABEL; programs that do not know the "
+                "extension show coloured points",
+                "Cesium, Babylon.js, PlayCanvas",
+            ),
+        ),
+        "splats.write_gltf", also=("gltf",),
+    ),
+    Export(
+        "tiles", "the map's colours as 3D Tiles",
+        (
+            ExportedFile(
+                "tiles/tileset.json",
+                "3D Tiles 1.1 of the map's colours, coarse from afar and fine nearby; in metres, on the globe where "
+                "GPS is known. Of a map that was made in parts it is always there",
+                "CesiumJS 1.130 or newer",
+            ),
+        ),
+        "tiles.write_tiles", when="in submaps", also=("3dtiles",),
+    ),
+    Export(
+        "mesh", "the surface with classes, and with a texture",
+        (
+            ExportedFile(
+                "mesh.ply",
+                "the surface with all its vertices, a colour and a label (property label) at each",
+                "MeshLab, trimesh",
+            ),
+            ExportedFile(
+                "mesh.glb",
+                "the surface with a tenth of those vertices and a texture made from the keyframes, exposure removed; "
+                "without export.texture, all vertices with their colours. Labels are the attribute _LABEL; unlit",
+                "Blender, game engines, the web",
+            ),
+        ),
+        "mesh.write_mesh", settings=("voxel", "max_blocks", "mesh_side", "planes", "texture"), when="always",
+        also=("texture",),
+    ),
+    Export(
+        "collision", "a light mesh to walk in",
+        (
+            ExportedFile(
+                "collision.glb",
+                "the surface to walk in, without colours: at most 20,000 triangles, and a floor without holes where "
+                "one was found",
+                "game engines, PlayCanvas",
+            ),
+        ),
+        "meshes.write_collision", needs="mesh",
+    ),
+    Export(
+        "usd", "the mesh as USDZ (needs the package usd-core)",
+        (
+            ExportedFile(
+                "mesh.usdz",
+                "the mesh as USD: the texture of mesh.glb or else colours, the class of each vertex as primvar label, "
+                "y up, and the metres of a unit in its metersPerUnit",
+                "Quick Look on Apple devices, Blender, Houdini, Omniverse",
+            ),
+        ),
+        "meshes.write_usd", needs="mesh", also=("usdz",),
+    ),
+    Export(
+        "floorplan", "the walls from above with their lengths",
+        (
+            ExportedFile(
+                "floorplan.svg",
+                "the walls seen from above, with their lengths, and the camera's path; ≥ where an end of a wall was "
+                "not seen, ≈ where a corner is flat and so uncertain. Needs to know which way is up",
+                "browsers, Inkscape",
+            ),
+        ),
+        "floor_plan.write_floor_plan", needs="mesh", also=("svg", "plan"),
+    ),
+)  # fmt: skip
+KIND_OF = {name: export.kind for export in EXPORTS for name in (export.kind, *export.also)}
+"""What people call a kind of file → its name."""
+
+WORLD_NOTE = ExportedFile(
+    "world.json", "what the axes are, how up was found, and the transform from the run's own frame"
+)
+NOTES = (
+    ExportedFile(
+        "classes.json",
+        'number, name and colour of each class; 255 is "unknown". A name has the same colour in every run unless the '
+        "data set gives its own; unnamed objects are grey",
+    ),
+    ExportedFile("scale.json", "how many metres a unit of the run is, how certain, and its sources"),
+    WORLD_NOTE,
+    ExportedFile(
+        "piece_2/ and so on",
+        "frames that are not connected to the rest: the same files for them, in a coordinate system of their own; RUN/"
+        "piece_2 is a run like any other for view, report, render and evaluate",
+        paths=(PIECES,),
+    ),
+)
+"""What a whole export has beside the kinds; of these each kind alone comes with `WORLD_NOTE`."""
+
+
+def export_of(kind: str) -> Export:
+    """Return the row of a kind, by any of its names. Raises ValueError for another name."""
+    row = next((export for export in EXPORTS if export.kind == KIND_OF.get(kind.lower())), None)
+    if row is None:
+        raise ValueError(f"{kind!r} is no kind of export: {', '.join(export.kind for export in EXPORTS)}")
+    return row
+
+
+def names_of(exports: Iterable[Export], notes: Iterable[ExportedFile]) -> set[str]:
+    """Return the first parts of the paths of these files, README.txt included."""
+    files = [*(file for export in exports for file in export.files), *notes]
+    return {README, *(top for file in files for top in file.tops if top != PIECES)}
+
+
+def kinds_help() -> str:
+    """Return a line for each kind, and the settings that matter for it alone."""
+    width = max(len(export.kind) for export in EXPORTS)
+    lines = []
+    for export in EXPORTS:
+        settings = f" ({', '.join(export.settings)})" if export.settings else ""
+        lines.append(f"{export.kind.ljust(width)}  {export.about}{settings}")
+    return "\n".join(lines)
+
+
+def files_table() -> str:
+    """Return the rows of the table in docs/files.md."""
+    lines = []
+    for export in EXPORTS:
+        request = "" if export.when == "always" else f"by `msgs-slam export RUN --only {export.kind}`: "
+        lines += [f"| `{f.name}` | {request}{f.about} | {f.opens} |" for f in export.files]
+    return "\n".join([*lines, *(f"| `{f.name}` | {f.about} | {f.opens} |" for f in NOTES)])
