@@ -112,7 +112,7 @@ def recorded_config(records: Mapping[str, StageRecord], config: Config) -> Confi
 
 def settings_of(config: Config, stage: str) -> dict[str, dict[str, Any]]:
     """Return the settings that a stage's record keeps."""
-    return {section: config_to_dict(getattr(config, section)) for section in ("run", stage)}
+    return {section: config_to_dict(getattr(config, section)) for section in ("run", stage) if hasattr(config, section)}
 
 
 def previous_settings(record: StageRecord, config: Config) -> list[str]:

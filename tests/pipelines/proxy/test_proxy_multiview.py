@@ -99,7 +99,7 @@ def test_both_rounds_of_completion_ask_the_same_views_where_one_is_missing(
     monkeypatch.setattr(stereo_provider, "build_inputs", lambda own, lenders, lent, warps: asked.append(warps) or True)
     monkeypatch.setattr(stereo_provider, "update_view_evidence", lambda case, others, warps: asked.append(warps))
     monkeypatch.setattr(fresh, "_completed", lambda index: index)
-    fresh.case(4)
+    fresh.inputs(4)
     assert len(asked) == 2
     assert len(asked[0]) == len(asked[1]) == min(6, len(room.frames) - 2)
     np.testing.assert_array_equal(asked[0], asked[1])

@@ -189,7 +189,7 @@ def test_a_network_that_sees_another_camera_is_told(
     assert any("focal length of" in w for w in context.warnings) == doubted
 
 
-KINDS = {"look_for_depth", "make_depths", "look_for_moving", "look_for_labels", "make_maps"}
+KINDS = {"precompute_depth", "make_depths", "find_moving_in", "precompute_labels", "make_maps"}
 
 
 def card(folder: Path) -> str:
