@@ -89,8 +89,8 @@ def fields_of(text: str, path: Path) -> Fields:
             data.append(content)
         elif not data and line.strip():
             said = line.strip().lstrip("#/ \t")
-    beside = data[min(1, len(data) - 1)] if data else ""  # the first may state a projection, or headings
-    divider = next((mark for mark in _DIVIDERS if mark in beside), None)
+    second = data[min(1, len(data) - 1)] if data else ""  # the first may state a projection, or headings
+    divider = next((mark for mark in _DIVIDERS if mark in second), None)
     with parsing(path, "table"):
         rows = [row for row in (_divided(line, divider) for line in data) if row]
         names = _divided(said, divider)

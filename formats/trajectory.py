@@ -100,7 +100,7 @@ def _is_within_reach(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class TimedPath:
     """N poses of a text file: world_from_cam (N, 4, 4), NaN for rows without one; times (N,) in seconds and names (N)
     of their images, None and () where the file has none; `is_counted`: the names are numbers of frames."""
 
@@ -110,7 +110,7 @@ class Trajectory:
     is_counted: bool = False
 
 
-def read_trajectory(path: Path) -> Trajectory:
+def read_trajectory(path: Path) -> TimedPath:
     """Read the poses of a text table: by its headings where they name position and quaternion, else TUM lines (with
     RTAB-Map's ninth column, the node's id, or without), or matrices as `read_matrices` does.
 
@@ -121,25 +121,25 @@ def read_trajectory(path: Path) -> Trajectory:
         raise InputError(f"{path} holds no numbers: check that it was written completely")
     width, chosen = len(table.rows[0]), _chosen_columns(table, path)
     if chosen is None and width not in (8, 9):
-        return Trajectory(read_matrices(path))
+        return TimedPath(read_matrices(path))
     columns = chosen or list(range(1, 8))
     if chosen is None:
         _require_tum(table.rows, path)
     values = _numbers(table.rows, columns, path)
     poses = poses_from_quaternions(values[:, 3:], values[:, :3], str(path))
     if (named := table.column(*_NAME)) is not None:
-        return Trajectory(poses, names=tuple(row[named] for row in table.rows))
+        return TimedPath(poses, names=tuple(row[named] for row in table.rows))
     if (counted := table.column(*_COUNT)) is not None:
         numbers = _numbers(table.rows, [counted], path)[:, 0]
         poses[~(np.abs(numbers) < _LARGEST_COUNT)] = np.nan
         names = tuple(f"{int(n):06d}" if abs(n) < _LARGEST_COUNT else f"row {k + 1}" for k, n in enumerate(numbers))
-        return Trajectory(poses, names=names, is_counted=True)
+        return TimedPath(poses, names=names, is_counted=True)
     timed = table.column(*_TIME) if chosen else 0
     if timed is None:
-        return Trajectory(poses)
+        return TimedPath(poses)
     times = _in_seconds(_numbers(table.rows, [timed], path)[:, 0])
     poses[~np.isfinite(times)] = np.nan
-    return Trajectory(poses, times)
+    return TimedPath(poses, times)
 
 
 def _chosen_columns(table: Fields, path: Path) -> list[int] | None:

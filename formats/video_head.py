@@ -38,7 +38,7 @@ _ALPHA, _COLOUR, _TRANSFER = 0x53C0, 0x55B0, 0x55BA
 
 
 @dataclass(frozen=True)
-class Track:
+class VideoTrack:
     """A video track: its size as stored, whether it is marked to be shown, "HLG", "PQ" or "" as its transfer function,
     whether it has an alpha channel, the share of its frames that its edit list shows, the number of these (0 = not
     said), and the matrix (a, b, c, d) by which it is shown: x' = a x + c y, y' = b x + d y."""
@@ -53,7 +53,7 @@ class Track:
     matrix: tuple[int, int, int, int] = _IDENTITY
 
 
-def read_tracks(path: Path) -> list[Track]:
+def read_tracks(path: Path) -> list[VideoTrack]:
     """Read the video tracks of an MP4, MOV, Matroska or WebM in their order; none of other files or a damaged head."""
     if moov := read_moov(path):
         return _tracks_of_moov(moov)
@@ -61,7 +61,7 @@ def read_tracks(path: Path) -> list[Track]:
         return _tracks_of_matroska(file.read(_MAX_MATROSKA_BYTES))
 
 
-def main_track(tracks: list[Track]) -> int:
+def main_track(tracks: list[VideoTrack]) -> int:
     """Return the number of the track to show: of those marked so and of more than one image, the largest."""
     return max(
         range(len(tracks)),
@@ -119,14 +119,14 @@ def _number(box: bytes, short: int, long: int, wide: bool = False) -> int:
     return int.from_bytes(box[place : place + size], "big")
 
 
-def _tracks_of_moov(moov: bytes) -> list[Track]:
+def _tracks_of_moov(moov: bytes) -> list[VideoTrack]:
     whole = memoryview(moov)
     traks = [content for kind, content in _boxes(whole) if kind == b"trak"]
     scale = _number(_box(whole, b"mvhd"), 12, 20)
     return [_track_of(t, scale) for t in traks if _box(t, b"mdia", b"hdlr")[8:12] == b"vide"]
 
 
-def _track_of(trak: memoryview, movie_scale: int) -> Track:
+def _track_of(trak: memoryview, movie_scale: int) -> VideoTrack:
     head, media = _box(trak, b"tkhd"), _box(trak, b"mdia", b"mdhd")
     entries = _box(trak, b"mdia", b"minf", b"stbl", b"stsd")
     entry = entries[16:]  # of the first description, behind its length and kind
@@ -134,7 +134,7 @@ def _track_of(trak: memoryview, movie_scale: int) -> Track:
     at = 52 if head[:1] == b"\1" else 40
     numbers = struct.unpack(">5i", head[at : at + 20]) if len(head) >= at + 20 else (1, 0, 0, 0, 1)
     length, scale = _number(media, 16, 24, wide=True), _number(media, 12, 20)
-    return Track(
+    return VideoTrack(
         int.from_bytes(entry[24:26], "big"), int.from_bytes(entry[26:28], "big"),
         bool(head[3:4]) and bool(head[3] & 1),
         TRANSFERS.get(int.from_bytes(found[1], "big"), "") if found else "",
@@ -201,7 +201,7 @@ def _elements(data: memoryview) -> Iterator[tuple[int, memoryview]]:
         at += size
 
 
-def _tracks_of_matroska(data: bytes) -> list[Track]:
+def _tracks_of_matroska(data: bytes) -> list[VideoTrack]:
     whole = memoryview(data)
     if int.from_bytes(data[:4], "big") != _EBML:
         return []
@@ -214,7 +214,7 @@ def _tracks_of_matroska(data: bytes) -> list[Track]:
     ]
 
 
-def _track_of_matroska(entry: dict[int, memoryview]) -> Track | None:
+def _track_of_matroska(entry: dict[int, memoryview]) -> VideoTrack | None:
     def number(found: dict[int, memoryview], name: int, default: int) -> int:
         return int.from_bytes(found[name][:8], "big") if name in found else default
 
@@ -222,7 +222,7 @@ def _track_of_matroska(entry: dict[int, memoryview]) -> Track | None:
         return None
     video = dict(_elements(entry.get(_VIDEO, memoryview(b""))))
     colour = dict(_elements(video.get(_COLOUR, memoryview(b""))))
-    return Track(
+    return VideoTrack(
         number(video, _WIDTH, 0), number(video, _HEIGHT, 0), bool(number(entry, _DEFAULT, 1)),
         TRANSFERS.get(number(colour, _TRANSFER, 0), ""), bool(number(video, _ALPHA, 0)),
     )  # fmt: skip

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from ..formats.atomic import unique_temp_names, write_text
-from ..formats.datasets import looks_like_recording
+from ..formats.datasets import is_recording_folder
 from ..formats.errors import InputError, RecoverableError
 from ..formats.images import VIDEO_SUFFIXES
 from ..formats.textfile import write_json
@@ -90,7 +90,7 @@ def _is_recording(path: Path) -> bool:
     if path.is_file():
         return path.suffix.lower() in VIDEO_SUFFIXES
     try:
-        return path.is_dir() and looks_like_recording(path)
+        return path.is_dir() and is_recording_folder(path)
     except InputError:  # it may not be read, which its own attempt reports
         return True
 

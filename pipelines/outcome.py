@@ -246,8 +246,8 @@ def _load_exposure(run: RunFolder, map_stage: str, trajectory: Trajectory) -> Ex
 
 def spread_sample(items: Sequence[T], limit: int) -> list[T]:
     """Return at most `limit` of the items, evenly spread, first and last among them."""
-    picked = np.unique(np.linspace(0, len(items) - 1, min(len(items), limit)).round().astype(int))
-    return [items[i] for i in picked]
+    chosen = np.unique(np.linspace(0, len(items) - 1, min(len(items), limit)).round().astype(int))
+    return [items[i] for i in chosen]
 
 
 def labels_of_channels(channels: NDArray, label_of_channel: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -179,8 +179,8 @@ def runs_near(path: Path, limit: int = 3) -> list[Path]:
     """Run folders that may be meant where `path` is none: in it, around it, of the video that it is, of a like name."""
     inside = sorted(path.iterdir()) if path.is_dir() else []
     named = [path.with_suffix(".msgs"), Path(f"{path.stem}.msgs")] if path.name else []  # "." and "/" have no name
-    beside = [*named, *path.parents[:2]]
-    found = dict.fromkeys(p for p in [*inside, *beside] if RunFolder(p).manifest_file.is_file())
+    places = [*named, *path.parents[:2]]
+    found = dict.fromkeys(p for p in [*inside, *places] if RunFolder(p).manifest_file.is_file())
     return list(found)[:limit]
 
 

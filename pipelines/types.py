@@ -299,7 +299,7 @@ class Metres:
     relative_sd: float
     is_guess: bool
     sources: tuple[str, ...]
-    alone: tuple[MetresSource, ...] = ()
+    by_source: tuple[MetresSource, ...] = ()
     disagreement: float = 1.0
     only_in_room: bool = False
 
@@ -311,9 +311,9 @@ class Metres:
     def text(self) -> str:
         """1 unit = about 0.83 m ± 18 % (estimated from floor height and 2 doors)."""
         *first, last = self.sources or ("nothing in particular",)
-        told = f"{', '.join(first)} and {last}" if first else last
-        told += ", if the scene is a room" if self.only_in_room else ""
+        text = f"{', '.join(first)} and {last}" if first else last
+        text += ", if the scene is a room" if self.only_in_room else ""
         about, guess = ("about ", "estimated ") if self.is_guess else ("", "")
         percent = 100 * self.relative_sd
         spread = f"{percent:.0f}" if percent >= 2 else f"{percent:.1f}"
-        return f"1 unit = {about}{self.per_unit:.{2 if self.is_guess else 3}g} m ± {spread} % ({guess}from {told})"
+        return f"1 unit = {about}{self.per_unit:.{2 if self.is_guess else 3}g} m ± {spread} % ({guess}from {text})"

@@ -12,7 +12,7 @@ READ_ELSEWHERE = {
     "evaluation.metrics.DepthError": "written to evaluation.json as a whole",
     "evaluation.metrics.SurfaceError": "written to evaluation.json as a whole",
     "evaluation.truth.ErrorStatistics": "written to evaluation.json as a whole",
-    "types.Metres.alone": "written to scale.json, for people",
+    "types.Metres.by_source": "written to scale.json, for people",
     "types.MetresSource": "written to scale.json, for people",
     "evaluation.views.MapView.coverage": "returned by `Run.draw` of the Python interface",
     "render.inspection.BlendingWeights.largest": "by the kernels that note it in training, which tests compare with it",

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msgs_slam.formats.datasets.sequence import Camera, Sequence
+from msgs_slam.formats.datasets.sequence import Camera, Dataset
 from msgs_slam.formats.reading import parsing, read_bytes
 from msgs_slam.formats.trajectory import poses_from_quaternions
 
@@ -17,7 +17,7 @@ def recognises(path: Path) -> bool:
     return (path / TABLE).is_file()
 
 
-def open_pose_table(path: Path) -> Sequence:
+def open_pose_table(path: Path) -> Dataset:
     """Raises InputError, by way of `parsing`, for a table that is not as described."""
     table = path / TABLE
     text = read_bytes(table, 50_000_000).decode("utf-8")
@@ -30,7 +30,7 @@ def open_pose_table(path: Path) -> Sequence:
         centers = np.array([[float(row[k]) for k in ("x", "y", "z")] for row in rows])
         quat_xyzw = np.array([[float(row[k]) for k in ("qx", "qy", "qz", "qw")] for row in rows])
         camera = Camera(int(width), int(height), fx, fy, cx, cy)
-    return Sequence(
+    return Dataset(
         format="pose-table",
         root=path,
         names=names,

@@ -31,7 +31,7 @@ from .matching import (
     read_timed_files,
     sequence_of,
 )
-from .sequence import Camera, LabelClass, Sequence, known_classes
+from .sequence import Camera, Dataset, LabelClass, known_classes
 
 _CLASS_FOLDERS = ("semantic_class", "semantic_classes")
 
@@ -55,7 +55,7 @@ _SEVEN_SCENES_NOTES = (
 )
 
 
-def open_seven_scenes(path: Path) -> Sequence:
+def open_seven_scenes(path: Path) -> Dataset:
     """One seq-XX folder of 7-Scenes. Metric poses; frames whose pose file is missing or not finite have none.
 
     The set names no calibration of the colour camera: camera-intrinsics-color.txt (3x3) is used where somebody made
@@ -94,7 +94,7 @@ def _seven_scenes_camera(path: Path, size: tuple[int, int], focal: float) -> Cam
     return Camera(width, height, float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
 
 
-def open_tum_rgbd(path: Path) -> Sequence:
+def open_tum_rgbd(path: Path) -> Dataset:
     """Open a TUM RGB-D sequence: metric poses of the colour camera, depth registered to colour.
 
     Images, depth and poses are joined by the nearest time within 20 ms. The calibration is intrinsics.json where
@@ -137,7 +137,7 @@ def _tum_camera(path: Path, image: Path) -> tuple[Camera | None, tuple[str, ...]
     return replace(camera, is_nominal=not found), notes
 
 
-def open_euroc(path: Path) -> Sequence:
+def open_euroc(path: Path) -> Dataset:
     """Open the left camera of a EuRoC sequence: metric poses, grey images with lens distortion, no depth.
 
     Poses are those of the body, moved to the camera by the extrinsics in sensor.yaml. Raises InputError where a table
@@ -194,7 +194,7 @@ def recognises_replica(path: Path) -> bool:
     return _is_nice_slam(path) or any(_is_rendered(p) for p in _candidates(path))
 
 
-def open_replica(path: Path) -> Sequence:
+def open_replica(path: Path) -> Dataset:
     """Open a Replica sequence; depth and poses are metric, class 0 is void.
 
     Without cam_params.json the renders have a horizontal field of view of 90 degrees in all layouts. Raises InputError
@@ -220,7 +220,7 @@ def _is_rendered(path: Path) -> bool:
     return (path / "rgb").is_dir() and any((path / name).is_dir() for name in _CLASS_FOLDERS)
 
 
-def _open_nice_slam(path: Path) -> Sequence:
+def _open_nice_slam(path: Path) -> Dataset:
     images = [p for p in list_images(path / "results") if p.name.startswith("frame")]
     parameters = next((p / "cam_params.json" for p in (path, path.parent) if (p / "cam_params.json").is_file()), None)
     camera, scale = _wide_camera(first_readable(images)), 6553.5
@@ -237,7 +237,7 @@ def _open_nice_slam(path: Path) -> Sequence:
     )  # fmt: skip
 
 
-def _open_rendered(path: Path) -> Sequence:
+def _open_rendered(path: Path) -> Dataset:
     images = list_images(path / "rgb")
     camera, scale = _wide_camera(first_readable(images)), None
     if (path / "cam_params.json").is_file():

@@ -9,20 +9,20 @@ from ..colmap_files import find_models
 from ..errors import InputError
 from ..image_folder import count_images, natural_key
 from ..reading import Listed, named_file, resolve_within
-from .matching import images_beside, sequence_of
-from .sequence import Camera, Sequence
+from .matching import images_outside, sequence_of
+from .sequence import Camera, Dataset
 
 _IMAGE_FOLDERS = ("images", "frames", ".", "rgb", "images_2", "images_4", "images_8")
 """Where a project keeps its images; those of images_N are reduced to one N-th, and the camera with them."""
 _LEVELS_UP, _MAX_NAMED = 3, 3
 
 
-def recognises(path: Path) -> bool:
+def is_colmap_model(path: Path) -> bool:
     """Recognise a folder with a complete model, as text or binary, with its images in reach."""
     return path.is_dir() and bool(find_models(path))
 
 
-def open_colmap(path: Path) -> Sequence:
+def open_colmap(path: Path) -> Dataset:
     """Open the images of a COLMAP project in natural order: those of its largest model, with poses in the model's own
     unit, and those beside them that it could not register.
 
@@ -44,8 +44,8 @@ def open_colmap(path: Path) -> Sequence:
     posed = {file: i for i, file in enumerate(files) if file is not None}
     if len(posed) < len(files) - files.count(None):
         raise InputError(f"{root}: two images of the model {folder} are one file there: put them where their names say")
-    beside = images_beside(list(posed))
-    names = {file: model.names[i] for file, i in posed.items()} | {f: f.relative_to(root).as_posix() for f in beside}
+    unposed = images_outside(list(posed))
+    names = {file: model.names[i] for file, i in posed.items()} | {f: f.relative_to(root).as_posix() for f in unposed}
     images = sorted(names, key=lambda file: natural_key(names[file]))
     poses = np.full((len(images), 4, 4), np.nan)
     poses[[file in posed for file in images]] = np.linalg.inv(
@@ -62,22 +62,22 @@ def open_colmap(path: Path) -> Sequence:
         mask_paths=masks if any(masks) else (),
         notes=(
             *notes,
-            *_notes(path, root, folder, others, len(posed), len(model.names), len(beside)),
+            *_notes(path, root, folder, others, len(posed), len(model.names), len(unposed)),
             *_other_folders(path, root, images),
         ),
     )  # fmt: skip
 
 
 def _notes(
-    path: Path, root: Path, folder: Path, others: list[Path], posed: int, in_model: int, beside: int
+    path: Path, root: Path, folder: Path, others: list[Path], posed: int, in_model: int, unposed: int
 ) -> tuple[str, ...]:
     """What of the project is missing, and what of it has no part in the sequence."""
     notes = []
     if posed < in_model:
         notes.append(f"{in_model - posed} of the model's {in_model} images are missing in {root}")
-    if beside:
+    if unposed:
         notes.append(
-            f"{beside} of the {posed + beside} images in {root.name}/ have no pose in the model {folder.name}/: they "
+            f"{unposed} of the {posed + unposed} images in {root.name}/ have no pose in the model {folder.name}/: they "
             f"are used as well. Where poses of the others help, give --poses {path}"
         )
     if others:

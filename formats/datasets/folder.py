@@ -11,7 +11,7 @@ from ..names import match_names
 from ..trajectory import read_trajectory
 from .calibration import read_intrinsics_json
 from .matching import classes_found, files_for_images, poses_at, poses_for_images, sequence_of
-from .sequence import Camera, LabelClass, Sequence, known_classes
+from .sequence import Camera, Dataset, LabelClass, known_classes
 
 _IMAGE_FOLDERS = ("rgb", "images", "color", "frames")
 _DEPTH_FOLDERS = ("depth", "depths")
@@ -20,12 +20,12 @@ _POSE_FILES = ("traj.txt", "trajectory.txt", "poses.txt", "groundtruth.txt")
 _INTRINSICS_FILES = ("intrinsics.json", "cam_params.json", "camera.json")
 
 
-def recognises(path: Path) -> bool:
+def is_plain_folder(path: Path) -> bool:
     """Recognise a folder of images, or one with a folder rgb/, images/, color/ or frames/."""
     return image_folder(path) is not None
 
 
-def open_folder(path: Path) -> Sequence:
+def open_folder(path: Path) -> Dataset:
     """Open a plain folder: only the images must be there.
 
     Beside or above them may be depth/ (16 bit PNG, millimetres unless depth_scale in the intrinsics says otherwise),

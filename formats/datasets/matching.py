@@ -16,7 +16,7 @@ from ..images import IMAGE_SUFFIXES, first_readable, image_size, is_depth_map
 from ..names import folded
 from ..reading import resolve_within
 from ..textfile import read_rows
-from .sequence import LabelClass, Sequence, used_label_ids
+from .sequence import Dataset, LabelClass, used_label_ids
 
 SENSOR_RATE = 30.0
 """Frames per second of the sensors of benchmarks that number their frames and state no times."""
@@ -74,7 +74,7 @@ def files_for_images(images: list[Path], folder: Path, pattern: str = "*") -> tu
     return found if any(found) else ()
 
 
-def images_beside(used: list[Path], taken: Iterable[Path | None] = ()) -> list[Path]:
+def images_outside(used: list[Path], taken: Iterable[Path | None] = ()) -> list[Path]:
     """Return the other images in the folders of those that are `used`: of the same kind and size, neither `taken` as
     something else nor called so."""
     first, others = first_readable(used), set(used).union(path for path in taken if path is not None)
@@ -135,13 +135,13 @@ def nearest_index(sorted_times: NDArray[np.float64], times: NDArray[np.float64])
     return np.where(closer, before, after).astype(np.int64)
 
 
-def sequence_of(format: str, root: Path, images: list[Path], **fields: Any) -> Sequence:
+def sequence_of(format: str, root: Path, images: list[Path], **fields: Any) -> Dataset:
     """Make the sequence of image files, called as they are, at the times that they state, unless the other `fields` say
     otherwise."""
     if "timestamps" not in fields:
         fields["timestamps"] = read_image_times(images)
     names = fields.pop("names", tuple(p.name for p in images))
-    return Sequence(format, root, names, image_paths=tuple(images), **fields)
+    return Dataset(format, root, names, image_paths=tuple(images), **fields)
 
 
 def times_at_sensor_rate(images: list[Path]) -> NDArray[np.float64]:

@@ -15,8 +15,8 @@ from ..images import first_readable, image_size
 from ..reading import Listed, named_file
 from ..textfile import number, optional_number, read_json_object
 from ..trajectory import OPENCV_FROM_OPENGL, clean_poses
-from .matching import images_beside, sequence_of
-from .sequence import Camera, Sequence, distortion_names
+from .matching import images_outside, sequence_of
+from .sequence import Camera, Dataset, distortion_names
 
 _FILE_NAMES = ("transforms.json", "transforms_train.json")
 _SUFFIXES_TRIED = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -34,12 +34,12 @@ _SAME_COEFFICIENT = 0.01
 """By which a distortion coefficient may differ from the mean of all images: less than a pixel for most of the image."""
 
 
-def recognises(path: Path) -> bool:
+def is_nerfstudio(path: Path) -> bool:
     """Recognise a folder with transforms.json, or that file itself."""
     return _file(path) is not None
 
 
-def open_nerfstudio(path: Path) -> Sequence:
+def open_nerfstudio(path: Path) -> Dataset:
     """Open the frames of a transforms.json in natural order of their names, and the images beside them for which it has
     no frame; missing images are left out and counted.
 
@@ -68,8 +68,8 @@ def open_nerfstudio(path: Path) -> Sequence:
     }
     taken = [p for paths in other.values() for p in paths.values()]
     # What transforms_train.json does not name is meant for testing.
-    beside = images_beside(list(frame_of), taken) if file.name == _FILE_NAMES[0] else []
-    paths = sorted([*frame_of, *beside], key=lambda p: natural_key(str(p)))
+    others = images_outside(list(frame_of), taken) if file.name == _FILE_NAMES[0] else []
+    paths = sorted([*frame_of, *others], key=lambda p: natural_key(str(p)))
     poses = np.stack([_matrix(frame_of[p], file) if p in frame_of else np.full((4, 4), np.nan) for p in paths])
     depths, masks = ([found.get(p) for p in paths] for found in other.values())
     return sequence_of(
@@ -80,18 +80,18 @@ def open_nerfstudio(path: Path) -> Sequence:
         metric=any(depths),
         depth_paths=tuple(depths) if any(depths) else (),
         mask_paths=tuple(masks) if any(masks) else (),
-        notes=notes + _notes(file, frames, len(kept), len(beside)),
+        notes=notes + _notes(file, frames, len(kept), len(others)),
     )  # fmt: skip
 
 
-def _notes(file: Path, frames: list[dict[str, Any]], kept: int, beside: int) -> tuple[str, ...]:
+def _notes(file: Path, frames: list[dict[str, Any]], kept: int, others: int) -> tuple[str, ...]:
     """What of the data set is missing, and what of it has no part in the sequence."""
     notes = []
     if kept < len(frames):
         notes.append(f"{len(frames) - kept} of {len(frames)} frames have no image on disk")
-    if beside:
+    if others:
         notes.append(
-            f"{beside} of {kept + beside} images have no frame in {file.name}: they are used as well. Where the poses "
+            f"{others} of {kept + others} images have no frame in {file.name}: they are used as well. Where the poses "
             f"of the others help, give --poses {file}"
         )
     unread = sorted({key for frame in frames for key in frame if key.endswith("_path")} - set(_READ_FILES))

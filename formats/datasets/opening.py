@@ -10,13 +10,13 @@ from ..image_folder import unused_pictures
 from ..images import IMAGE_SUFFIXES, UNREAD_SUFFIXES
 from ..reading import reaching
 from . import benchmarks, colmap, folder, nerfstudio, scannet
-from .sequence import Sequence
+from .sequence import Dataset
 
 
 @dataclass(frozen=True)
 class _Reader:
     recognises: Callable[[Path], bool]
-    open: Callable[[Path], Sequence]
+    open: Callable[[Path], Dataset]
 
 
 # In the order of trying: a plain folder of images comes last, because most data sets are also that.
@@ -28,11 +28,11 @@ _READERS = {
         lambda path: any((root / "cam0" / "data.csv").is_file() for root in (path / "mav0", path)),
         benchmarks.open_euroc,
     ),
-    "scannet": _Reader(scannet.recognises, scannet.open_scannet),
+    "scannet": _Reader(scannet.is_scannet, scannet.open_scannet),
     "sens": _Reader(lambda path: path.is_file() and path.suffix.lower() == ".sens", scannet.open_sens),
-    "nerfstudio": _Reader(nerfstudio.recognises, nerfstudio.open_nerfstudio),
-    "colmap": _Reader(colmap.recognises, colmap.open_colmap),
-    "folder": _Reader(folder.recognises, folder.open_folder),
+    "nerfstudio": _Reader(nerfstudio.is_nerfstudio, nerfstudio.open_nerfstudio),
+    "colmap": _Reader(colmap.is_colmap_model, colmap.open_colmap),
+    "folder": _Reader(folder.is_plain_folder, folder.open_folder),
 }
 
 _IMAGE_FOLDERS = frozenset({"rgb", "images", "color", "results"})
@@ -68,7 +68,7 @@ def recognise_source(path: Path) -> str | None:
     return next((name for name in names if not (holds_images and name in _NOT_FROM_INSIDE)), None)
 
 
-def looks_like_recording(path: Path) -> bool:
+def is_recording_folder(path: Path) -> bool:
     """Return whether a folder holds images, or a data set, or what is left of one: opening it may still fail, with the
     reason.
 
@@ -91,7 +91,7 @@ def _recognise(path: Path) -> tuple[str, Path] | None:
     return (names[0], path) if names else None
 
 
-def open_sequence(path: Path, format: str = "auto") -> Sequence:
+def open_sequence(path: Path, format: str = "auto") -> Dataset:
     """Open a recorded sequence of a known data set, or a folder of images with its companion files.
 
     Images are not read yet, text files are. Raises InputError for an unknown format, a missing path, a path that is
@@ -108,7 +108,7 @@ def open_sequence(path: Path, format: str = "auto") -> Sequence:
         return _open(path, format)
 
 
-def _open(path: Path, format: str) -> Sequence:
+def _open(path: Path, format: str) -> Dataset:
     found = _recognise(path) if format == "auto" else (format, path)
     if found is None:
         raise InputError(

@@ -16,7 +16,7 @@ from ..reading import opened, require_file
 from ..textfile import read_table
 from ..trajectory import clean_poses, read_matrices
 from .matching import classes_found, files_for_images, sequence_of, times_at_sensor_rate
-from .sequence import Camera, LabelClass, Sequence, find_label_table, read_nyu40_classes
+from .sequence import Camera, Dataset, LabelClass, find_label_table, read_nyu40_classes
 
 _VERSION = 4
 _JPEG, _PNG = 2, 1
@@ -29,12 +29,12 @@ _LABEL_FOLDERS = ("label-filt", "label")
 _COLOR_SIZE, _DEPTH_SIZE = (1296, 968), (640, 480)
 
 
-def recognises(path: Path) -> bool:
+def is_scannet(path: Path) -> bool:
     """Recognise color/ and pose/ with one text file a frame."""
     return (path / "color").is_dir() and (path / "pose").is_dir() and any((path / "pose").glob("*.txt"))
 
 
-def open_scannet(path: Path) -> Sequence:
+def open_scannet(path: Path) -> Dataset:
     """Open an exported ScanNet scene: metric poses, of which lost frames have none, depth of its own camera.
 
     Labels are joined to the NYU40 classes where scannetv2-labels.combined.tsv is in the folder or above it, else
@@ -137,7 +137,7 @@ class SensFrames:
             return file.read(length)
 
 
-def open_sens(path: Path) -> Sequence:
+def open_sens(path: Path) -> Dataset:
     """Open a .sens recording: metric poses, of which lost frames have none, depth of its own camera, no labels.
 
     Raises InputError for another version or compression, and for a file that ends before its frames do.
@@ -149,7 +149,7 @@ def open_sens(path: Path) -> Sequence:
     frames = SensFrames(path, header.depth_kind, header.depth_size, *index)
     count = header.frame_count
     increasing = bool((np.diff(times) > 0).all() and times[-1] > times[0])
-    return Sequence(
+    return Dataset(
         format="sens",
         root=path,
         names=tuple(f"{i:06d}.jpg" for i in range(count)),

@@ -64,7 +64,7 @@ class FrameStore(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Sequence:
+class Dataset:
     """N frames of one camera.
 
     names: N file names, unique, in order. timestamps (N,) seconds, strictly increasing, as measured or counted at the

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from ...formats.datasets import Sequence
+from ...formats.datasets import Dataset
 from ...formats.errors import InputError
 from ..geometry import se3
 from ..mapping.division import split_frames
@@ -65,7 +65,7 @@ PROTOCOL = (
 
 def evaluate_outcome(
     outcome: Outcome,
-    truth: Sequence,
+    truth: Dataset,
     progress: Progress | None = None,
     max_views: int = 100,
     class_map: ClassMap | None = None,
@@ -127,7 +127,7 @@ def frame_cells(outcome: Outcome, matched: MatchedTruth) -> dict[str, Any]:
     }
 
 
-def camera_cells(outcome: Outcome, truth: Sequence) -> dict[str, Any]:
+def camera_cells(outcome: Outcome, truth: Dataset) -> dict[str, Any]:
     """The focal length against the true one at the same image size."""
     calibration = outcome.calibration
     k = calibration.intrinsics
@@ -166,7 +166,7 @@ def trajectory_cells(outcome: Outcome, matched: MatchedTruth) -> tuple[dict[str,
     return cells, best
 
 
-def scale_cells(outcome: Outcome, trajectory: dict[str, Any], truth: Sequence) -> dict[str, Any]:
+def scale_cells(outcome: Outcome, trajectory: dict[str, Any], truth: Dataset) -> dict[str, Any]:
     """The metres per unit that the run states, with their relative sd, beside the true ones by Sim(3)."""
     if not truth.metric:
         return {"missing": FREE_TRUTH}
@@ -197,7 +197,7 @@ def _ate(centers: NDArray, true_centers: NDArray, with_scale: bool) -> dict[str,
     return {**asdict(error.statistics), "scale": error.alignment.scale, "frames": len(centers)}
 
 
-def _ate_of_every(every: Trajectory, sequence: Sequence, with_scale: bool) -> dict[str, Any]:
+def _ate_of_every(every: Trajectory, sequence: Dataset, with_scale: bool) -> dict[str, Any]:
     if not has_times(sequence):
         return {"missing": "the truth has no times"}
     truth = match_by_time(every.timestamps, sequence)

@@ -178,7 +178,7 @@ def found_lengths(outcome: Outcome) -> list[tuple[str, str]]:
     shown = in_world(outcome, world)
     rows = [("length of the path", path_length(shown))]
     if world.has_floor:
-        rows.append(("camera height above the floor", camera_height(shown)))
+        rows.append(("camera height above the floor", measured_camera_height(shown)))
     if world.axes == "up" and shown.gaussian_map is not None:
         rows += list(zip(("length", "width", "height"), extents(shown), strict=False))
     texts = [(what, length_text(*found, shown.metric, shown.metres)) for what, found in rows if found is not None]
@@ -199,7 +199,7 @@ def path_length(outcome: Outcome) -> tuple[float, float] | None:
     return float(np.linalg.norm(steps, axis=1).sum()), np.sqrt(2) * stray
 
 
-def camera_height(outcome: Outcome) -> tuple[float, float]:
+def measured_camera_height(outcome: Outcome) -> tuple[float, float]:
     """Median over the floor, which is at 0, and how it goes up and down (16th to 84th percentile, halved)."""
     low, middle, high = np.quantile(outcome.trajectory.centers[outcome.trajectory.is_posed, 2], (0.16, 0.5, 0.84))
     return float(middle), float(high - low) / 2

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.datasets import Sequence
+from ...formats.datasets import Dataset
 from ...formats.errors import InputError
 from ...formats.image_folder import frame_number
 from ...formats.textfile import read_rows
@@ -34,7 +34,7 @@ class MatchedTruth:
     """For N frames of a run: world_from_cam (N, 4, 4), NaN without; image (N,) index into the sequence, -1 without;
     `by`: how they were matched, in words."""
 
-    sequence: Sequence
+    sequence: Dataset
     world_from_cam: NDArray[np.float64]
     image: NDArray[np.int64]
     by: str
@@ -47,7 +47,7 @@ class MatchedTruth:
 def match_truth(
     frames: list[Frame],
     names_are_the_sources: bool,
-    sequence: Sequence,
+    sequence: Dataset,
     image_of: Callable[[Frame], NDArray[np.uint8]] | None = None,
     is_timed: bool = True,
 ) -> MatchedTruth:
@@ -78,19 +78,19 @@ def match_truth(
     return _match_images(kinds[best], sequence, best)
 
 
-def match_outcome(outcome: Outcome, sequence: Sequence) -> MatchedTruth:
+def match_outcome(outcome: Outcome, sequence: Dataset) -> MatchedTruth:
     """Match the frames of a run, see `match_truth`."""
     return match_truth(outcome.frames, outcome.source_is_folder, sequence, outcome.run.image, outcome.is_timed)
 
 
-def _match_images(image: NDArray[np.int64], sequence: Sequence, by: str) -> MatchedTruth:
+def _match_images(image: NDArray[np.int64], sequence: Dataset, by: str) -> MatchedTruth:
     poses = np.full((len(image), 4, 4), np.nan)
     if sequence.world_from_cam is not None:
         poses[image >= 0] = sequence.world_from_cam[image[image >= 0]]
     return MatchedTruth(sequence, poses, image, by)
 
 
-def _by_numbers(frames: list[Frame], names_are_the_sources: bool, sequence: Sequence) -> dict[str, NDArray[np.int64]]:
+def _by_numbers(frames: list[Frame], names_are_the_sources: bool, sequence: Dataset) -> dict[str, NDArray[np.int64]]:
     """Images by the number in their name: that in the frame's name, or a video's frame, counted from 0 or 1."""
     index_of = {frame_number(Path(name)): i for i, name in enumerate(sequence.names)}
     if len(index_of) < len(sequence) or None in index_of:
@@ -106,7 +106,7 @@ def _by_numbers(frames: list[Frame], names_are_the_sources: bool, sequence: Sequ
 
 
 def _likeness(
-    frames: list[Frame], image: NDArray[np.int64], sequence: Sequence, image_of: Callable[[Frame], NDArray[np.uint8]]
+    frames: list[Frame], image: NDArray[np.int64], sequence: Dataset, image_of: Callable[[Frame], NDArray[np.uint8]]
 ) -> float:
     """Median correlation of grey thumbnails of matched images."""
 
@@ -119,12 +119,12 @@ def _likeness(
     return float(np.median([(a * b).mean() for a, b in pairs]))
 
 
-def has_times(sequence: Sequence) -> bool:
+def has_times(sequence: Dataset) -> bool:
     """Whether images or poses of the truth have times."""
     return sequence.timestamps is not None or _dense_trajectory(sequence.root) is not None
 
 
-def match_by_time(times: NDArray[np.float64], sequence: Sequence) -> MatchedTruth:
+def match_by_time(times: NDArray[np.float64], sequence: Dataset) -> MatchedTruth:
     """Match the instants (N,) in seconds, which may differ from the sequence's by a constant; `has_times` of it."""
     pose_times, true_poses = true_trajectory(sequence)
     image_times = np.zeros(0) if sequence.timestamps is None else sequence.timestamps
@@ -145,7 +145,7 @@ def _tolerance(times: NDArray[np.float64]) -> float:
     return min(_MAX_SECONDS_APART, float(np.median(np.diff(times))) / 3) if len(times) > 1 else _MAX_SECONDS_APART
 
 
-def true_trajectory(sequence: Sequence) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def true_trajectory(sequence: Dataset) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(N,) times and (N, 4, 4) world_from_cam: of the images, or of a traj.txt that is denser than the images.
 
     A recording may keep all its poses and times and only every k-th image.

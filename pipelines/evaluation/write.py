@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ...formats.atomic import write_text
-from ...formats.datasets import Sequence
+from ...formats.datasets import Dataset
 from ...formats.images import write_rgb
 from ...formats.textfile import write_json
 from ..geometry.se3 import Similarity, align_points
@@ -42,7 +42,7 @@ TITLES = ("frame", "map", "depth of the map", "true depth", "error, white = 10 %
 
 def write_evaluation(
     run: RunFolder,
-    truth: Sequence,
+    truth: Dataset,
     progress: Progress | None = None,
     max_views: int = 100,
     class_map: ClassMap | None = None,

@@ -107,8 +107,8 @@ def _drawn(wall: Wall, ends: Array, per_unit: float, unit: str, spread: float) -
     x, y = ends.mean(axis=0) + 16 * outside
     length = wall.length * per_unit
     digits = int(np.clip(np.ceil(-np.log10(max(spread * length, 0.01))), 0, 2))
-    told = f"{wall.sign}{length:.{digits}f} {unit}"
-    parts.append(f'<text transform="translate({x:.1f} {y:.1f}) rotate({turn:.1f})" dy="5">{told}</text>')
+    text = f"{wall.sign}{length:.{digits}f} {unit}"
+    parts.append(f'<text transform="translate({x:.1f} {y:.1f}) rotate({turn:.1f})" dy="5">{text}</text>')
     return "".join(parts)
 
 
@@ -202,7 +202,7 @@ class _Faces:
         """Which of them have about this angle."""
         return np.asarray(np.abs((self.angle - angle + np.pi) % (2 * np.pi) - np.pi) < _OF_DIRECTION)
 
-    def beside(self, line: _Line) -> tuple[_Faces, _Faces]:
+    def next_to(self, line: _Line) -> tuple[_Faces, _Faces]:
         """Those on a line, and those that are neither on it nor near it and look another way."""
         mine = self.facing(line.angle)
         far = np.abs((self.centers[:, :2] - line.place) @ (-line.along[1], line.along[0])) / self.height * _STEPS
@@ -228,7 +228,7 @@ def find_walls(vertices: NDArray, faces: NDArray) -> list[Wall]:
     walls: list[Wall] = []
     left = upright
     while (found := max((_strongest_line(left, angle) for angle in angles), key=lambda line: line.area)).area > 0:
-        here, left = left.beside(found)
+        here, left = left.next_to(found)
         walls += [
             Wall(found.place + np.array([[start], [end]]) * found.along) for start, end in _stretches(here, found)
         ]
@@ -326,10 +326,13 @@ def _between_ends(walls: list[Wall], faces: _Faces) -> list[Wall]:
         wall = Wall(np.stack([first.ends[1], second.ends[0]]))
         if not 3 * step < wall.length < _BETWEEN * faces.height or _touch(first, second, step):
             continue
-        away, looks = faces.centers[:, :2] - wall.ends[0], np.stack([np.cos(faces.angle), np.sin(faces.angle)], axis=1)
+        away, directions = (
+            faces.centers[:, :2] - wall.ends[0],
+            np.stack([np.cos(faces.angle), np.sin(faces.angle)], axis=1),
+        )
         t = away @ wall.along
         here = (np.abs(away @ wall.normal) < 2 * step) & (t >= 0) & (t <= wall.length)
-        here &= looks @ wall.normal > _SAME_WAY
+        here &= directions @ wall.normal > _SAME_WAY
         if here.any() and len(_full_columns(faces.only(here), t[here])) * 2 * step > _COVERED * wall.length:
             found.append(wall)
     return found
@@ -379,9 +382,9 @@ def _without_doubles(walls: list[Wall], height: float) -> list[Wall]:
         if short.normal @ long.normal < _SAME_WAY:
             return False
         away = short.ends[0] + np.linspace(0, 1, 21)[:, None] * (short.ends[1] - short.ends[0]) - long.ends[0]
-        beside = np.abs(away @ long.normal) < _BESIDE * height
+        next_to = np.abs(away @ long.normal) < _BESIDE * height
         inside = (away @ long.along > -_BESIDE * height) & (away @ long.along < long.length + _BESIDE * height)
-        return bool((beside & inside).mean() > 0.5)
+        return bool((next_to & inside).mean() > 0.5)
 
     kept: list[Wall] = []
     for wall in sorted(walls, key=lambda wall: -wall.length):

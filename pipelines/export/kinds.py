@@ -122,7 +122,7 @@ EXPORTS = (
                 "splat viewers",
             ),
         ),
-        "splats.write_ply", when="always", also=("gaussians", "splat", "point_cloud", "pointcloud"),
+        "splats.write_splat_ply", when="always", also=("gaussians", "splat", "point_cloud", "pointcloud"),
     ),
     Export(
         "spz", "the map's colours, a tenth of the PLY's size",

@@ -17,7 +17,7 @@ _PART = 1 << 17
 """Gaussians of a part that is written at a time: a cloud takes more memory than the map it is of."""
 
 
-def write_ply(scene: ExportScene, target: Target) -> None:
+def write_splat_ply(scene: ExportScene, target: Target) -> None:
     """Write the map as splat PLYs in its own colours and in those of the classes; the probabilities are in the first
     only."""
     outcome = scene.outcome

@@ -57,17 +57,17 @@ class FrameMasks:
     before undistortion.
 
     `folder` keeps what the networks name, and `folder / "moving"` what of it is left out: what moves, or all of it with
-    `frames.people=mask`; `picked` names the image of a frame.
+    `frames.people=mask`; `chosen` names the image of a frame.
     """
 
     def __init__(
-        self, config: Config, source: Recording, folder: Path, picked: Path, threads: int,
+        self, config: Config, source: Recording, folder: Path, chosen: Path, threads: int,
         faces: Faces | None = None, rig: Rig = ONE_CAMERA,
     ) -> None:  # fmt: skip
         self._source, self._are_given = source, bool(config.frames.masks)
         self._files = masks_for(config, source)
         self._cards, self._is_forced = _cards(config), config.frames.people == "mask"
-        self.folder, self._picked, self._threads = folder, picked, threads
+        self.folder, self._picked, self._threads = folder, chosen, threads
         self._faces, self._rig = faces, rig
 
     def find_people(self, frames: Sequence[Frame], keyframes: Sequence[int], progress: Progress) -> None:
@@ -124,8 +124,8 @@ class FrameMasks:
         near = {k for i, area in enumerate(moving) if area.any() for k in range(ends[i], ends[i + 2] + 1)}
         self._search([frames[k] for k in sorted(near)], progress)
         for k in sorted(near - set(keyframes)):
-            beside = slice(max(bisect(keyframes, k) - 1, 0), bisect(keyframes, k) + 1)
-            self._save_moving(frames[k], ~_nearer(*(reduce(np.logical_or, areas[beside]) for areas in (kept, moving))))
+            nearest = slice(max(bisect(keyframes, k) - 1, 0), bisect(keyframes, k) + 1)
+            self._save_moving(frames[k], ~_nearer(*(reduce(np.logical_or, areas[nearest]) for areas in (kept, moving))))
         verdicts = np.concatenate([verdict[np.unique(parts[parts > 0])] for parts, verdict in judged])
         counts = {"named": len(verdicts), "still": int((verdicts > 0).sum()), "moving": int((verdicts < 0).sum())}
         write_json(self._table, counts | {"matches": matches})

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.datasets import Sequence as Recording
+from ...formats.datasets import Dataset
 from ...formats.errors import InputError
 from ..providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider, Sequence, class_colors
 from ..sfm.lens import FramePixels
@@ -19,7 +19,7 @@ from ..types import VOID, ClassTable, Frame
 class _RecordingMaps:
     """What depth and labels share: frames are images of the recording, its maps cover its images."""
 
-    def __init__(self, recording: Recording, sequence: Sequence) -> None:
+    def __init__(self, recording: Dataset, sequence: Sequence) -> None:
         self._recording, self._sequence = recording, sequence
         self.name = f"files of the data set ({recording.format})"
 
@@ -37,7 +37,7 @@ class RecordingDepth(_RecordingMaps, DepthProvider):
 
     metric = True
 
-    def __init__(self, recording: Recording, sequence: Sequence) -> None:
+    def __init__(self, recording: Dataset, sequence: Sequence) -> None:
         """Raises InputError for a data set without depth."""
         if not recording.has_depth:
             raise InputError(f"{recording.root}: this {recording.format} recording has no depth: --depth files:FOLDER")
@@ -67,7 +67,7 @@ class RecordingLabels(_RecordingMaps, SemanticsProvider):
 
     shared_state = ("_label_of",)
 
-    def __init__(self, recording: Recording, sequence: Sequence, progress: Progress) -> None:
+    def __init__(self, recording: Dataset, sequence: Sequence, progress: Progress) -> None:
         """Raises InputError for a data set without labels."""
         if not recording.has_labels:
             raise InputError(

@@ -12,7 +12,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from ...formats.datasets import Sequence as Recording
+from ...formats.datasets import Dataset
 from ...formats.errors import InputError, SettingError
 from ..config import Config, ProxyConfig
 from ..networks.card import Card, read_card
@@ -58,7 +58,7 @@ class ProviderContext:
     threads: int
     device: str
     progress: Progress
-    recording: Recording | None = None
+    recording: Dataset | None = None
     no_people: bool = False
     may_fuse: bool = True
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 Arrays = Mapping[str, NDArray]
 MESH = "mesh.ply"
 _LARGEST_HALF = 65504
-_ALONE = (
+_BY_SOURCE = (
     "what each source says without the others, as the mean of its readings: a table may be a desk or a coffee table. "
     "Together they pick the readings that agree, which may lie outside of all of these means. Usual distances are a "
     "weak prior that every guess begins with."
@@ -336,12 +336,12 @@ map."""
 # export ---------------------------------------------------------------------------------------------------------
 
 
-_TOLD = ("text", "about_alone")
+_DERIVED_KEYS = ("text", "about_by_source")
 """Keys for people: what they say follows from the others."""
 
 METRES: RunFile[Metres | None] = RunFile(
     "scale.json", ("export",), "scale",
-    lambda row: row if row is None else dataclass_from_json(Metres, {k: row[k] for k in row if k not in _TOLD}),
-    lambda metres: None if metres is None else {"text": metres.text, **asdict(metres), "about_alone": _ALONE},
+    lambda row: row if row is None else dataclass_from_json(Metres, {k: row[k] for k in row if k not in _DERIVED_KEYS}),
+    lambda metres: None if metres is None else {"text": metres.text, **asdict(metres), "about_by_source": _BY_SOURCE},
 )  # fmt: skip
 """How long the world's unit is: the value, its sentence, and what each source says; null where metres are unknown."""

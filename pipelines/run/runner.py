@@ -243,8 +243,8 @@ def _run_one(stage: Stage, context: StageContext, now: Situation) -> StageRecord
     files = results(folder)
     seconds, memory = time.monotonic() - started, peak_memory_mb()
     content, settings = content_digest(files), settings_of(now.config, stage.name)
-    told, reads = finite_or_none(figures), reads_in(folder)
-    record = StageRecord(reads, files, seconds, memory, told, context.warnings, content, settings)
+    finite, reads = finite_or_none(figures), reads_in(folder)
+    record = StageRecord(reads, files, seconds, memory, finite, context.warnings, content, settings)
     seal(folder, record)
     return record
 

@@ -64,7 +64,7 @@ TOPS = {
     "seating": ("seat", SEAT),
 }
 """Class names of networks and data sets whose upper side has a usual height: the name for people, and the heights."""
-THINGS = ("door", "level surface", *dict.fromkeys(told for told, _ in TOPS.values()))
+THINGS = ("door", "level surface", *dict.fromkeys(label for label, _ in TOPS.values()))
 """Sources that are counted: 2 doors, 3 chairs."""
 DOORS = ("door", "double door")
 FLOORS = ("floor", "rug", "carpet", "road", "earth", "ground")

@@ -151,14 +151,14 @@ def _tops(scene: Scene, heights: Array, upward: Array) -> list[Evidence]:
     above = (upward > _LEVEL) & (heights > _OVER_FLOOR * scene.median_depth)
     above &= ~disputed(scene.label, scene.names, scene.voxels)
     known: dict[str, list[tuple[float, Sizes]]] = defaultdict(list)
-    for name, (told, sizes) in TOPS.items():
+    for name, (label, sizes) in TOPS.items():
         for members in _instances(scene, above & scene.named((name,)), _MIN_TOP):
             found = _levels(scene, heights, members)
             if found:
-                known[told].append((found[0], sizes))
+                known[label].append((found[0], sizes))
     return [
-        measured(told, told, height, sizes, wrong=_WRONG_NAME, length_sd=_LENGTH_SD)
-        for told, things in known.items()
+        measured(label, label, height, sizes, wrong=_WRONG_NAME, length_sd=_LENGTH_SD)
+        for label, things in known.items()
         for height, sizes in things[:_MAX_OF_A_KIND]
     ]
 

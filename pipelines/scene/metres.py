@@ -163,13 +163,13 @@ def known_evidence(run: RunFolder) -> list[Evidence]:
 def describe(pieces: Sequence[Evidence]) -> Metres:
     """The combination of the pieces, with the sources by name and what each says alone."""
     combined = combine(pieces)
-    alone = tuple(MetresSource(p.source, float(np.exp(p.log_scale)), p.sd) for p in pieces)
+    by_source = tuple(MetresSource(p.source, float(np.exp(p.log_scale)), p.sd) for p in pieces)
     return Metres(
         per_unit=combined.factor,
         relative_sd=combined.sd,
         is_guess=all(p.is_guess for p in pieces),
         sources=_names(pieces, combined),
-        alone=alone,
+        by_source=by_source,
         disagreement=combined.disagreement,
     )
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.datasets import Camera, Sequence, open_sequence, recognise_source
+from ...formats.datasets import Camera, Dataset, open_sequence, recognise_source
 from ...formats.errors import InputError
 from ...formats.image_folder import list_images, read_image_times, times_file, unread_images
 from ...formats.images import Header, Reading, is_depth_map, is_plain, read_rgb, read_transparent
@@ -88,7 +88,7 @@ class Recording(ABC):
         """Return the camera that a data set states, at the size of its images; None without."""
         return None
 
-    def dataset(self) -> Sequence | None:
+    def dataset(self) -> Dataset | None:
         """Return the data set with its depth, labels and poses; None for a video and for plain images."""
         return None
 
@@ -216,7 +216,7 @@ def is_of_source(path: Path, run: RunFolder) -> bool:
 class ImageRecording(Recording):
     """Images of one size; `headers` are those of the images that can be read."""
 
-    def __init__(self, sequence: Sequence) -> None:
+    def __init__(self, sequence: Dataset) -> None:
         """Read the headers. Raises InputError where they are not of one camera."""
         self.sequence = s = sequence
         self.path, self.expected_frames = s.root, len(s)
@@ -319,7 +319,7 @@ class FolderRecording(ImageRecording):
         names, notes = tuple(image.name for image in images), _notes_on_unread(path)
         if len(images) < len(listed):
             notes += (f"{len(listed) - len(images)} depth maps among the images are left out",)
-        super().__init__(Sequence("images", path, names, read_image_times(images), tuple(images), notes=notes))
+        super().__init__(Dataset("images", path, names, read_image_times(images), tuple(images), notes=notes))
 
     @cached_property
     def digest(self) -> str:
@@ -374,7 +374,7 @@ class DatasetRecording(ImageRecording):
         camera = self.sequence.camera
         return None if camera is None else camera.resized(self.width, self.height)
 
-    def dataset(self) -> Sequence:
+    def dataset(self) -> Dataset:
         """Do as `Recording` says."""
         return self.sequence
 

@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
 
 from msgs_slam.formats.atomic import write_text
-from msgs_slam.formats.datasets import Sequence, open_sequence
+from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.textfile import read_json_object, write_json
 from msgs_slam.pipelines.config import Config
@@ -66,7 +66,7 @@ class Job:
 
 def ablate(
     source: Path,
-    truth: Sequence,
+    truth: Dataset,
     folder: Path,
     config: Config,
     seeds: tuple[int, ...],
@@ -105,7 +105,7 @@ def _require(variants: tuple[str, ...], seeds: tuple[int, ...]) -> None:
         )
 
 
-def _claim(folder: Path, source: Path, truth: Sequence, config: Config) -> None:
+def _claim(folder: Path, source: Path, truth: Dataset, config: Config) -> None:
     """Refuse a folder of another ablation: its finished runs would stand in the same table."""
     stamp = {
         "source": str(source.resolve()),
@@ -149,7 +149,7 @@ def _bring_up_to_date(source: Path, job: Job, first: Job, progress: Progress) ->
     reconstruct(source, job.run, job.config, progress, until=_LAST)
 
 
-def _measure(job: Job, truth: Sequence, progress: Progress, max_views: int) -> None:
+def _measure(job: Job, truth: Dataset, progress: Progress, max_views: int) -> None:
     """Write the figures of a run beside it, unless they are those of what it holds now."""
     file = _figures_file(job)
     stamp = {name: record.content for name, record in load_records(job.run).items()} | {"views": max_views}
@@ -183,9 +183,7 @@ METRICS: dict[str, tuple[tuple[str, ...], float, str]] = {
 """
 
 
-def _collected(
-    source: Path, truth: Sequence, config: Config, seeds: tuple[int, ...], jobs: list[Job]
-) -> dict[str, Any]:
+def _collected(source: Path, truth: Dataset, config: Config, seeds: tuple[int, ...], jobs: list[Job]) -> dict[str, Any]:
     rows = []
     missing: dict[str, str] = {}
     for name in dict.fromkeys(j.variant for j in jobs):

@@ -27,7 +27,7 @@ import torch
 from mapping import ABLATIONS, noisy_depth, noisy_labels
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets import Sequence, open_sequence
+from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.depth.align import fit_fields
 from msgs_slam.pipelines.depth.fields import FINE, field_scales
@@ -51,18 +51,18 @@ class Shot:
     true_depth: NDArray[np.float32]
     true_labels: NDArray[np.uint8]
 
-    def view(self, sequence: Sequence, camera: Intrinsics, classes: tuple[int, ...]) -> View:
+    def view(self, sequence: Dataset, camera: Intrinsics, classes: tuple[int, ...]) -> View:
         """As mapping sees it, at its true pose."""
         return make_view(self.index, camera, pose_of(sequence, self.index), self.image, self.maps, classes)
 
 
-def pose_of(sequence: Sequence, index: int) -> NDArray[np.float64]:
+def pose_of(sequence: Dataset, index: int) -> NDArray[np.float64]:
     """True cam_from_world (4, 4)."""
     assert sequence.world_from_cam is not None
     return np.linalg.inv(sequence.world_from_cam[index])
 
 
-def load_shots(sequence: Sequence, camera: Intrinsics, indices: range, depth: str, labels: str) -> list[Shot]:
+def load_shots(sequence: Dataset, camera: Intrinsics, indices: range, depth: str, labels: str) -> list[Shot]:
     """Frames with depth and labels of the given kinds, all of the camera's size."""
     rng, shots = np.random.default_rng(0), []
     size = (camera.width, camera.height)
@@ -105,7 +105,7 @@ def agreeing(views: list[View]) -> list[View]:
     return list(without_contradicted_depth(LruSequence(len(scaled), scaled.__getitem__, lambda v: v.nbytes, math.inf)))
 
 
-def measure(sequence: Sequence, shots: list[Shot], camera: Intrinsics, config: Config) -> dict[str, float]:
+def measure(sequence: Dataset, shots: list[Shot], camera: Intrinsics, config: Config) -> dict[str, float]:
     """Map the stretch and compare it with the truth; depth in centimetres."""
     held_out = [s for n, s in enumerate(shots) if n % 8 == 4]
     used = [s for n, s in enumerate(shots) if n % 8 != 4]

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from proxy import TimedProgress
 from scipy.spatial import cKDTree
 
-from msgs_slam.formats.datasets import Sequence, open_sequence
+from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.mesh import read_mesh_ply
 from msgs_slam.pipelines.config import ProxyConfig
@@ -161,7 +161,7 @@ class Labelled:
         return np.where(known, np.append(self._mesh_labels, VOID)[vertex], VOID).astype(np.uint8)
 
 
-def measure(labelled: Labelled, truth: Sequence, own_map: ClassMap | None) -> dict[str, dict[str, Any]]:
+def measure(labelled: Labelled, truth: Dataset, own_map: ClassMap | None) -> dict[str, dict[str, Any]]:
     """Figures by kind over the keyframes with true labels."""
     outcome = labelled.outcome
     matching = match_classes(labelled.names, outcome.vocabulary, truth.class_names, own_map)
@@ -175,7 +175,7 @@ def measure(labelled: Labelled, truth: Sequence, own_map: ClassMap | None) -> di
     return {kind: tally.row(matching) for kind, tally in tallies.items()}
 
 
-def _true_labels(outcome: Outcome, truth: Sequence) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+def _true_labels(outcome: Outcome, truth: Dataset) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     matched = match_truth(outcome.frames, outcome.source_is_folder, truth)
     pixels = FramePixels(outcome.calibration)
     for frame_id in outcome.trajectory.frame_ids[outcome.trajectory.is_keyframe].tolist():
@@ -188,7 +188,7 @@ def _true_labels(outcome: Outcome, truth: Sequence) -> Iterator[tuple[int, NDArr
 # pictures -------------------------------------------------------------------------------------------------------
 
 
-def write_sheet(labelled: Labelled, truth: Sequence | None, target: Path) -> None:
+def write_sheet(labelled: Labelled, truth: Dataset | None, target: Path) -> None:
     """Frame, network, fused, map, mesh and truth of a few keyframes, names written into the larger areas."""
     outcome = labelled.outcome
     colors = [*outcome.classes.colors, *((90, 90, 90) for _ in labelled.names[len(outcome.classes) :])]

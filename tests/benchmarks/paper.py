@@ -26,7 +26,7 @@ import numpy as np
 from ablate import branch
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets import Sequence, open_sequence
+from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.formats.textfile import read_json_object, write_json
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
@@ -70,7 +70,7 @@ ABLATIONS: dict[str, tuple[dict[str, float], tuple[str, ...]]] = {
 """Name → constants of the paper that change, and settings of both methods. A term that a method lacks has no row."""
 
 
-def network_like(sequence: Sequence, folder: Path, count: int) -> Path:
+def network_like(sequence: Dataset, folder: Path, count: int) -> Path:
     """Write the true depth with a network's kind of error, a 16-bit PNG in millimetres a frame."""
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
@@ -89,7 +89,7 @@ def network_like(sequence: Sequence, folder: Path, count: int) -> Path:
 
 
 def measured(
-    source: Path, run: RunFolder, config: Config, truth: Sequence, constants: Constants = PAPER
+    source: Path, run: RunFolder, config: Config, truth: Dataset, constants: Constants = PAPER
 ) -> dict[str, Any]:
     """Reconstruct with these constants of the paper, evaluate; what is done and unchanged is not done again."""
     stages.constants_of = paper_constants.constants_of = lambda config: constants  # in every stage of this process
@@ -122,7 +122,7 @@ def row(name: str, runs: list[list[float | None]]) -> str:
     return f"| {name} | {' | '.join(cells)} |"
 
 
-def linked(sequence: Sequence, folder: Path, count: int) -> Path:
+def linked(sequence: Dataset, folder: Path, count: int) -> Path:
     """Make a folder of the first images."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in sequence.names[:count]:
@@ -161,7 +161,7 @@ def main() -> None:
 
 
 def main_table(
-    given: argparse.Namespace, truth: Sequence, methods: dict[str, str], known: list[str], count: int
+    given: argparse.Namespace, truth: Dataset, methods: dict[str, str], known: list[str], count: int
 ) -> None:
     """Print both methods on the first frames beside the printed figures."""
     print(f"\n{HEAD}", flush=True)
@@ -175,7 +175,7 @@ def main_table(
     print("\nScanNet cannot be had here (its licence); neither can Metric3D-V2's weights.")
 
 
-def ablations(given: argparse.Namespace, truth: Sequence, methods: dict[str, str], known: list[str]) -> None:
+def ablations(given: argparse.Namespace, truth: Dataset, methods: dict[str, str], known: list[str]) -> None:
     """Print tables 7 to 10 of both methods; frames and proxies are made once."""
     source = linked(truth, given.work / f"first_{given.ablation_frames}", given.ablation_frames)
     seeds = given.seeds.split(",")

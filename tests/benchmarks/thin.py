@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets import Sequence, open_sequence
+from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.evaluation.views import render_outcome
 from msgs_slam.pipelines.geometry.camera import resample_nearest
@@ -43,7 +43,7 @@ Depths = Iterator[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.flo
 """Depth, weight, true depth and the bars of each keyframe, all (H, W)."""
 
 
-def proxy_depths(run: RunFolder, truth: Sequence) -> Depths:
+def proxy_depths(run: RunFolder, truth: Dataset) -> Depths:
     """Of the proxy stage, weighted by its reliability."""
     for frame in run.load(FRAMES):
         if run.holds(PROXY_MAPS, of=frame.id):
@@ -51,7 +51,7 @@ def proxy_depths(run: RunFolder, truth: Sequence) -> Depths:
             yield maps.depth, maps.confidence, *_true(truth, frame.source_index, *maps.depth.shape)
 
 
-def map_depths(run: RunFolder, truth: Sequence) -> Depths:
+def map_depths(run: RunFolder, truth: Dataset) -> Depths:
     """Of the map, seen from the keyframes."""
     outcome = load_outcome(run)
     index = {f.id: f.source_index for f in outcome.frames}
@@ -62,7 +62,7 @@ def map_depths(run: RunFolder, truth: Sequence) -> Depths:
             yield depth, np.ones_like(depth), *_true(truth, index[frame_id], *depth.shape)
 
 
-def _true(truth: Sequence, index: int, height: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _true(truth: Dataset, index: int, height: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     depth, labels = truth.depth(index), truth.labels(index)
     assert depth is not None
     assert labels is not None

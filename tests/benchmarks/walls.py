@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets import Sequence, open_sequence
+from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.export.floor_plan import Wall, find_walls, walls_of_run
 from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
@@ -18,7 +18,7 @@ STEP, VIEWS, JUMP = 4, 30, 1.06
 """Every so many pixels, of so many views; a depth that many times another's lies on another surface."""
 
 
-def true_walls(truth: Sequence, exported_from_truth: Similarity) -> list[Wall]:
+def true_walls(truth: Dataset, exported_from_truth: Similarity) -> list[Wall]:
     """Walls of the surfaces that the data set's depth shows."""
     camera, vertices, faces, count = truth.camera, [], [], 0
     assert camera is not None

@@ -26,7 +26,7 @@ from tokenizers import Tokenizer, normalizers, pre_tokenizers, trainers
 from tokenizers import models as tokenizer_models
 
 from msgs_slam.formats.colmap import read_colmap_model, write_colmap_model
-from msgs_slam.formats.datasets import Camera, Sequence, open_sequence, recognise_source
+from msgs_slam.formats.datasets import Camera, Dataset, open_sequence, recognise_source
 from msgs_slam.formats.datasets.calibration import read_intrinsics_json
 from msgs_slam.formats.datasets.sequence import read_class_table, read_nyu40_classes
 from msgs_slam.formats.errors import InputError
@@ -201,7 +201,7 @@ def data_set(format: str) -> Callable[[Path], None]:
     return read
 
 
-def judge_frame(recording: Sequence, index: int) -> None:
+def judge_frame(recording: Dataset, index: int) -> None:
     recording.rgb(index)
     depth = recording.depth(index)
     if depth is not None:
@@ -410,7 +410,7 @@ def make_head(folder: Path) -> None:
 def make_tokenizer(folder: Path) -> None:
     """Byte-level BPE with CLIP's normaliser and end of words, which knows a few words."""
     tokenizer = Tokenizer(tokenizer_models.BPE(unk_token="?", end_of_word_suffix="</w>"))
-    tokenizer.normalizer = normalizers.Sequence([normalizers.NFC(), normalizers.Lowercase()])
+    tokenizer.normalizer = normalizers.Dataset([normalizers.NFC(), normalizers.Lowercase()])
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     trainer = trainers.BpeTrainer(special_tokens=["?"], end_of_word_suffix="</w>", vocab_size=120, show_progress=False)
     tokenizer.train_from_iterator(["a photo of a lamp and a sofa, a lamp"], trainer)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from msgs_slam.formats.datasets import VOID_LABEL, Camera, Sequence, open_sequence, recognise
+from msgs_slam.formats.datasets import VOID_LABEL, Camera, Dataset, open_sequence, recognise
 from msgs_slam.formats.datasets.matching import poses_at
 from msgs_slam.formats.datasets.sequence import warp_nearest
 from msgs_slam.formats.errors import InputError
@@ -17,7 +17,7 @@ from msgs_slam.formats.trajectory import write_tum
 from tests.matrices import random_poses, write_matrices
 
 
-def _depth_disagreement(sequence: Sequence, i: int, j: int) -> float:
+def _depth_disagreement(sequence: Dataset, i: int, j: int) -> float:
     """Median relative difference between depth of frame j and that of frame i moved there by the poses."""
     depth1, depth2 = sequence.depth(i), sequence.depth(j)
     assert depth1 is not None

@@ -10,7 +10,7 @@ import trimesh
 from finished import note_finished
 from numpy.typing import NDArray
 
-from msgs_slam.formats.datasets import Sequence, open_sequence
+from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.config import Config, MappingConfig
@@ -25,12 +25,12 @@ OracleRun = Callable[..., RunFolder]
 
 
 @pytest.fixture(scope="session")
-def truth(world_sequence: Path) -> Sequence:
+def truth(world_sequence: Path) -> Dataset:
     return open_sequence(world_sequence)
 
 
 @pytest.fixture(scope="session")
-def oracle_run(truth: Sequence, tmp_path_factory: pytest.TempPathFactory) -> OracleRun:
+def oracle_run(truth: Dataset, tmp_path_factory: pytest.TempPathFactory) -> OracleRun:
     """Makes a run whose poses, depth and labels are the truth's, its world moved by a similarity.
 
     metric, rename (classes lose their names), wrong_poses (N, 3) metres added to the camera centres, video (the run
@@ -67,7 +67,7 @@ def oracle_run(truth: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Ora
     return make
 
 
-def _write_frames(run: RunFolder, truth: Sequence, video: bool) -> list[Frame]:
+def _write_frames(run: RunFolder, truth: Dataset, video: bool) -> list[Frame]:
     folder = run.stage("frames")
     frames = []
     for i, name in enumerate(truth.names):
@@ -81,7 +81,7 @@ def _write_frames(run: RunFolder, truth: Sequence, video: bool) -> list[Frame]:
     return frames
 
 
-def _write_proxy(run: RunFolder, truth: Sequence, frames: list[Frame], metric: bool, rename: bool) -> ClassTable:
+def _write_proxy(run: RunFolder, truth: Dataset, frames: list[Frame], metric: bool, rename: bool) -> ClassTable:
     folder = run.stage("proxy")
     names = tuple(f"segment {i}" for i in range(len(truth.classes))) if rename else truth.class_names
     classes = ClassTable(names, tuple(c.color or (9, 9, 9) for c in truth.classes))
@@ -98,7 +98,7 @@ def _write_proxy(run: RunFolder, truth: Sequence, frames: list[Frame], metric: b
     return classes
 
 
-def _trajectory(truth: Sequence, frames: list[Frame], move: Similarity, wrong_centers: NDArray | None) -> Trajectory:
+def _trajectory(truth: Dataset, frames: list[Frame], move: Similarity, wrong_centers: NDArray | None) -> Trajectory:
     assert truth.world_from_cam is not None
     world_from_cam = truth.world_from_cam.copy()
     if wrong_centers is not None:
@@ -113,7 +113,7 @@ def _trajectory(truth: Sequence, frames: list[Frame], move: Similarity, wrong_ce
     )
 
 
-def _seeded_map(truth: Sequence, move: Similarity, stride: int) -> tuple[GaussianMap, list[int]]:
+def _seeded_map(truth: Dataset, move: Similarity, stride: int) -> tuple[GaussianMap, list[int]]:
     """A Gaussian at every `stride`-th pixel of every keyframe, as large as its pixels."""
     means, radii, colors, labels, anchors = [], [], [], [], []
     assert truth.camera is not None

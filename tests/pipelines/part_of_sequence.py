@@ -3,10 +3,10 @@
 from collections.abc import Iterable
 from dataclasses import replace
 
-from msgs_slam.formats.datasets import Sequence
+from msgs_slam.formats.datasets import Dataset
 
 
-def part_of(sequence: Sequence, indices: Iterable[int]) -> Sequence:
+def part_of(sequence: Dataset, indices: Iterable[int]) -> Dataset:
     """The sequence of these frames only; one whose pictures, depths and labels are files."""
     keep = list(indices)
     paths = {n: tuple(getattr(sequence, n)[i] for i in keep) for n in ("image_paths", "depth_paths", "label_paths")}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.datasets import Sequence, opening
+from msgs_slam.formats.datasets import Dataset, opening
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import Config
@@ -63,7 +63,7 @@ def test_depth_provider(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None
     assert selection.choose_depth(load_config().proxy).kind == "multiview"
 
 
-def test_data_set(monkeypatch: pytest.MonkeyPatch, truth: Sequence, tmp_path: Path) -> None:
+def test_data_set(monkeypatch: pytest.MonkeyPatch, truth: Dataset, tmp_path: Path) -> None:
     import pose_table
 
     assert truth.camera is not None

@@ -12,7 +12,7 @@ import trimesh
 from finished import note_finished
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.datasets import Sequence, open_sequence
+from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.trajectory import write_tum
@@ -37,7 +37,7 @@ OracleRun = Callable[..., RunFolder]
 MOVE = Similarity(2.5, Rotation.from_euler("xyz", (0.3, -0.5, 0.9)).as_matrix(), np.array([4.0, -2.0, 1.0]))
 
 
-def test_every_cell_of_a_true_run(oracle_run: OracleRun, truth: Sequence) -> None:
+def test_every_cell_of_a_true_run(oracle_run: OracleRun, truth: Dataset) -> None:
     run = oracle_run(hold_out=8, mesh=True)
     result = write_evaluation(run, truth, max_views=4)
     assert json.loads((run.root / "evaluation" / "evaluation.json").read_text()) == result
@@ -69,7 +69,7 @@ def test_every_cell_of_a_true_run(oracle_run: OracleRun, truth: Sequence) -> Non
     assert (run.root / "evaluation" / "views.png").stat().st_size > 20_000
 
 
-def test_a_similarity_of_the_whole_run_changes_no_figure_but_the_scale(oracle_run: OracleRun, truth: Sequence) -> None:
+def test_a_similarity_of_the_whole_run_changes_no_figure_but_the_scale(oracle_run: OracleRun, truth: Dataset) -> None:
     plain, moved = (
         evaluate_outcome(load_outcome(oracle_run(m, metric=False, mesh=True)), truth, max_views=2) for m in (None, MOVE)
     )
@@ -92,7 +92,7 @@ def test_a_similarity_of_the_whole_run_changes_no_figure_but_the_scale(oracle_ru
     assert wrong["depth"]["metric_l1"] > 2
 
 
-def test_noise_on_the_poses_is_found_in_ate_and_costs_picture_quality(oracle_run: OracleRun, truth: Sequence) -> None:
+def test_noise_on_the_poses_is_found_in_ate_and_costs_picture_quality(oracle_run: OracleRun, truth: Dataset) -> None:
     noise = np.random.default_rng(0).normal(scale=0.06, size=(32, 3))
     result = evaluate_outcome(load_outcome(oracle_run(wrong_centers=noise)), truth, max_views=3)
     # 96 numbers, 7 fitted: 0.06 sqrt(3) sqrt(89 / 96), give or take 1 / sqrt(2 x 89).
@@ -101,7 +101,7 @@ def test_noise_on_the_poses_is_found_in_ate_and_costs_picture_quality(oracle_run
     assert own < true - 0.5
 
 
-def test_labels_without_names_are_a_clustering_and_stand_apart(oracle_run: OracleRun, truth: Sequence) -> None:
+def test_labels_without_names_are_a_clustering_and_stand_apart(oracle_run: OracleRun, truth: Dataset) -> None:
     by_name = evaluate_outcome(load_outcome(oracle_run()), truth, max_views=2)["labels"]
     renamed = evaluate_outcome(load_outcome(oracle_run(rename=True)), truth, max_views=2)["labels"]
     assert "mean_iou" not in renamed
@@ -109,7 +109,7 @@ def test_labels_without_names_are_a_clustering_and_stand_apart(oracle_run: Oracl
     assert renamed["clustering"]["majority"]["pixel_accuracy"] >= renamed["clustering"]["one to one"]["pixel_accuracy"]
 
 
-def test_a_video_is_matched_by_time_and_a_shifted_clock_too(oracle_run: OracleRun, truth: Sequence) -> None:
+def test_a_video_is_matched_by_time_and_a_shifted_clock_too(oracle_run: OracleRun, truth: Dataset) -> None:
     result = evaluate_outcome(load_outcome(oracle_run(video=True)), part_of(truth, range(0, 32, 2)), max_views=1)
     assert result["frames"]["with true pose"] == 32  # traj.txt keeps the poses of the images left out
     assert result["frames"]["with true image"] == 16
@@ -128,7 +128,7 @@ def test_a_video_is_matched_by_time_and_a_shifted_clock_too(oracle_run: OracleRu
     [("{:06d}.png", "file name"), ("f{:03d}.png", "frame number"), ("p-{:d}.png", "frame number, counted from 1")],
 )
 def test_a_truth_without_times_is_matched_by_what_its_names_say(
-    oracle_run: OracleRun, truth: Sequence, tmp_path: Path, name: str, by: str
+    oracle_run: OracleRun, truth: Dataset, tmp_path: Path, name: str, by: str
 ) -> None:
     first = 1 if by.endswith("1") else 0
     folder = _untimed_copy(truth, tmp_path, {i: name.format(i + first) for i in range(1, 32, 2)})
@@ -139,7 +139,7 @@ def test_a_truth_without_times_is_matched_by_what_its_names_say(
 
 
 def test_a_truth_without_times_that_nothing_assigns_is_refused(
-    oracle_run: OracleRun, truth: Sequence, tmp_path: Path
+    oracle_run: OracleRun, truth: Dataset, tmp_path: Path
 ) -> None:
     run = load_outcome(oracle_run(video=True))
     subsampled = _untimed_copy(truth, tmp_path / "a", {i: f"frame_{1 + i // 4:05d}.png" for i in range(0, 32, 4)})
@@ -151,7 +151,7 @@ def test_a_truth_without_times_that_nothing_assigns_is_refused(
 
 
 def test_times_that_only_count_the_frames_match_nothing(
-    oracle_run: OracleRun, truth: Sequence, monkeypatch: pytest.MonkeyPatch
+    oracle_run: OracleRun, truth: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = load_outcome(oracle_run())
     for record in run.records.values():
@@ -165,7 +165,7 @@ def test_times_that_only_count_the_frames_match_nothing(
 
 
 def test_tum_lines_of_traj_txt_are_the_truth_between_the_images(
-    oracle_run: OracleRun, truth: Sequence, tmp_path: Path
+    oracle_run: OracleRun, truth: Dataset, tmp_path: Path
 ) -> None:
     assert truth.timestamps is not None
     assert truth.world_from_cam is not None
@@ -178,7 +178,7 @@ def test_tum_lines_of_traj_txt_are_the_truth_between_the_images(
     assert result["trajectory"]["sim3 all"]["max"] < 1e-6
 
 
-def _untimed_copy(truth: Sequence, folder: Path, names: dict[int, str]) -> Sequence:
+def _untimed_copy(truth: Dataset, folder: Path, names: dict[int, str]) -> Dataset:
     """The images of `truth` under other names, with their poses in traj.txt."""
     folder.mkdir(exist_ok=True)
     assert truth.world_from_cam is not None
@@ -190,7 +190,7 @@ def _untimed_copy(truth: Sequence, folder: Path, names: dict[int, str]) -> Seque
     return sequence
 
 
-def test_a_truth_of_free_unit_claims_no_metres(oracle_run: OracleRun, truth: Sequence) -> None:
+def test_a_truth_of_free_unit_claims_no_metres(oracle_run: OracleRun, truth: Dataset) -> None:
     assert truth.world_from_cam is not None
     poses = truth.world_from_cam.copy()
     poses[:, :3, 3] *= 0.13
@@ -211,7 +211,7 @@ def test_a_truth_of_free_unit_claims_no_metres(oracle_run: OracleRun, truth: Seq
     assert "units of the truth" in truth_section(result, load_outcome(run))
 
 
-def test_every_image_of_the_source_is_judged_beside_the_picked_frames(oracle_run: OracleRun, truth: Sequence) -> None:
+def test_every_image_of_the_source_is_judged_beside_the_picked_frames(oracle_run: OracleRun, truth: Dataset) -> None:
     outcome = load_outcome(oracle_run(video=True))
     every = outcome.trajectory
     picked = replace(outcome, frames=outcome.frames[::2], trajectory=rows_of(every, every.frame_ids[::2]), every=every)
@@ -223,14 +223,14 @@ def test_every_image_of_the_source_is_judged_beside_the_picked_frames(oracle_run
     assert "ATE SE(3), every image" in table
 
 
-def test_dense_poses_beside_sparse_images(truth: Sequence, shared_data: Path) -> None:
+def test_dense_poses_beside_sparse_images(truth: Dataset, shared_data: Path) -> None:
     times, poses = true_trajectory(open_sequence(shared_data / "whiteroom"))
     assert len(times) == len(poses) == 450
     assert len(true_trajectory(truth)[0]) == 32
 
 
 def test_the_truth_of_another_recording_and_an_unfinished_run_are_refused(
-    oracle_run: OracleRun, truth: Sequence, tmp_path: Path
+    oracle_run: OracleRun, truth: Dataset, tmp_path: Path
 ) -> None:
     run = oracle_run(video=True)
     late = replace(truth, timestamps=truth.timestamps + 0.05, root=tmp_path)
@@ -242,7 +242,7 @@ def test_the_truth_of_another_recording_and_an_unfinished_run_are_refused(
 
 
 def test_a_frame_that_is_all_masked_is_not_judged(
-    oracle_run: OracleRun, truth: Sequence, monkeypatch: pytest.MonkeyPatch
+    oracle_run: OracleRun, truth: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = oracle_run()
     monkeypatch.setattr(RunFolder, "left_out", lambda self, frame: np.full(self.image(frame).shape[:2], frame.id == 0))
@@ -251,7 +251,7 @@ def test_a_frame_that_is_all_masked_is_not_judged(
     assert all(view["frame_id"] > 0 and view["psnr"] < 60 for view in views)
 
 
-def test_without_a_map_the_poses_are_still_judged(oracle_run: OracleRun, truth: Sequence) -> None:
+def test_without_a_map_the_poses_are_still_judged(oracle_run: OracleRun, truth: Dataset) -> None:
     run = oracle_run()
     note_finished(run, ("frames", "proxy", "tracking"))
     result = write_evaluation(run, truth)
@@ -260,7 +260,7 @@ def test_without_a_map_the_poses_are_still_judged(oracle_run: OracleRun, truth: 
     assert not (run.root / "evaluation" / "views.png").exists()
 
 
-def test_a_mesh_exported_into_another_world_is_brought_back(oracle_run: OracleRun, truth: Sequence) -> None:
+def test_a_mesh_exported_into_another_world_is_brought_back(oracle_run: OracleRun, truth: Dataset) -> None:
     run = oracle_run(metric=False, mesh=True)
     outcome = load_outcome(run)
     matched = match_truth(outcome.frames, outcome.source_is_folder, truth)

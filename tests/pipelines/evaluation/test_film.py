@@ -13,7 +13,7 @@ from finished import note_finished
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.datasets import Sequence
+from msgs_slam.formats.datasets import Dataset
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.image_folder import list_images
 from msgs_slam.formats.images import read_rgb, write_rgb
@@ -41,7 +41,7 @@ from tests.world import make_world, walk
 OracleRun = Callable[..., RunFolder]
 
 
-def test_own_path_in_colour_shows_the_frames(oracle_run: OracleRun, truth: Sequence, tmp_path: Path) -> None:
+def test_own_path_in_colour_shows_the_frames(oracle_run: OracleRun, truth: Dataset, tmp_path: Path) -> None:
     folder = render_run(oracle_run(), tmp_path / "pictures", kind="color", path="own", fps=1.6)
     pictures = [read_rgb(p) for p in list_images(folder)]
     assert len(pictures) == 5
@@ -294,7 +294,7 @@ def test_bad_files_are_refused_with_the_entry(changes: dict[str, Any], said: str
 
 
 def test_a_run_is_drawn_from_the_keyframes_of_either_world(
-    oracle_run: OracleRun, truth: Sequence, tmp_path: Path
+    oracle_run: OracleRun, truth: Dataset, tmp_path: Path
 ) -> None:
     run, camera, file = oracle_run(), truth.camera, tmp_path / "path.json"
     assert camera is not None

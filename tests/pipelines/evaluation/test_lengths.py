@@ -9,8 +9,14 @@ import torch
 from finished import note_finished
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.datasets import Sequence
-from msgs_slam.pipelines.evaluation.facts import camera_height, extents, found_lengths, length_text, path_length
+from msgs_slam.formats.datasets import Dataset
+from msgs_slam.pipelines.evaluation.facts import (
+    extents,
+    found_lengths,
+    length_text,
+    measured_camera_height,
+    path_length,
+)
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import TRAJECTORY
@@ -30,7 +36,7 @@ def _exported(run: RunFolder, move: Similarity, floor: bool = True) -> RunFolder
     return run
 
 
-def test_lengths_of_the_made_up_room(oracle_run: OracleRun, truth: Sequence) -> None:
+def test_lengths_of_the_made_up_room(oracle_run: OracleRun, truth: Dataset) -> None:
     outcome = load_outcome(oracle_run())
     assert truth.world_from_cam is not None
     centers = truth.world_from_cam[:, :3, 3]
@@ -38,7 +44,7 @@ def test_lengths_of_the_made_up_room(oracle_run: OracleRun, truth: Sequence) -> 
     assert length is not None
     assert length[0] == pytest.approx(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum(), rel=1e-3)
     assert 0 < length[1] < 0.02
-    assert camera_height(outcome)[0] == pytest.approx(np.median(centers[:, 2]), abs=1e-3)
+    assert measured_camera_height(outcome)[0] == pytest.approx(np.median(centers[:, 2]), abs=1e-3)
     (long, _), (wide, _), (high, _) = extents(outcome)
     assert long == pytest.approx(LENGTH, rel=0.02)
     assert 0.8 * WIDTH < wide < WIDTH  # half a lap does not see the walls on its own side

@@ -15,7 +15,7 @@ import torch
 import trimesh
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from msgs_slam.formats.datasets import Sequence
+from msgs_slam.formats.datasets import Dataset
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.reading import file_sha256
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
@@ -264,7 +264,7 @@ def test_weights_are_not_downloaded(installed: Path) -> None:
 
 
 def test_a_cell_of_the_evaluation(
-    oracle_run: OracleRun, truth: Sequence, installed: Path, monkeypatch: pytest.MonkeyPatch
+    oracle_run: OracleRun, truth: Dataset, installed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = oracle_run()
     figures = evaluate_outcome(load_outcome(run), truth, max_views=2)

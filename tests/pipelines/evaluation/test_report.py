@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from finished import note_finished
 
-from msgs_slam.formats.datasets import Sequence
+from msgs_slam.formats.datasets import Dataset
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import decode_rgb
 from msgs_slam.formats.mesh import TexturedMesh, write_textured_glb
@@ -59,7 +59,7 @@ class Balanced(HTMLParser):
         self.text += data
 
 
-def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, truth: Sequence) -> None:
+def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, truth: Dataset) -> None:
     run = oracle_run()
     write_evaluation(run, truth, max_views=1)
     svg = '<svg xmlns="http://www.w3.org/2000/svg" onload="alert(1)"><script>alert(1)</script></svg>'
@@ -109,7 +109,7 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     assert len(html) < 3_000_000
 
 
-def test_an_evaluation_of_an_earlier_map_is_not_shown_as_of_this_one(oracle_run: OracleRun, truth: Sequence) -> None:
+def test_an_evaluation_of_an_earlier_map_is_not_shown_as_of_this_one(oracle_run: OracleRun, truth: Dataset) -> None:
     run = oracle_run()
     evaluation, outcome = write_evaluation(run, truth, max_views=1), load_outcome(run)
     assert "ATE Sim(3)" in truth_section(evaluation, outcome)

@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 from finished import note_finished
 
-from msgs_slam.formats.datasets import Sequence
+from msgs_slam.formats.datasets import Dataset
 from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.pipelines.config import Config, FramesConfig
 from msgs_slam.pipelines.export import colmap
@@ -128,7 +128,7 @@ def test_splats_and_what_they_are_trained_on_stand_in_one_world_with_y_down(
 
 
 def test_images_are_as_large_as_the_source_and_fit_their_camera(
-    oracle_run: OracleRun, truth: Sequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    oracle_run: OracleRun, truth: Dataset, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     run = oracle_run()
     with_points(run)
@@ -164,7 +164,7 @@ def test_images_are_as_large_as_the_source_and_fit_their_camera(
 
 
 def test_another_source_under_the_same_name_is_not_taken(
-    oracle_run: OracleRun, truth: Sequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    oracle_run: OracleRun, truth: Dataset, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     run = oracle_run()
     for i, name in enumerate(truth.names):

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.datasets import Sequence
+from msgs_slam.formats.datasets import Dataset
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.config import Config, ExportConfig
@@ -189,7 +189,7 @@ def test_a_recorded_path_is_in_the_world_of_the_files() -> None:
     assert path["keyframes"][0]["fov_degrees"] == pytest.approx(50)
 
 
-def test_the_tape_is_true_within_what_it_states(page: tuple[Path, Outcome], truth: Sequence) -> None:
+def test_the_tape_is_true_within_what_it_states(page: tuple[Path, Outcome], truth: Dataset) -> None:
     text, outcome = page[0].read_text(encoding="utf-8"), page[1]
     c, rng, rows, rays, places = truth.camera, np.random.default_rng(1), [], [], []
     assert c is not None

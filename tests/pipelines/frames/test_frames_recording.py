@@ -9,7 +9,7 @@ import pytest
 from layouts import LAYOUTS, START, seven_scenes, tum
 from PIL import Image
 
-from msgs_slam.formats.datasets import Camera, Sequence, open_sequence
+from msgs_slam.formats.datasets import Camera, Dataset, open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import Config
@@ -33,13 +33,13 @@ from tests.pipelines.part_of_sequence import part_of
 
 
 @pytest.fixture(scope="session")
-def short(truth: Sequence) -> Sequence:
+def short(truth: Dataset) -> Dataset:
     """Five frames of the room are enough to tell one layout from another."""
     return part_of(truth, range(0, 20, 4))
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_each_layout_is_recognised_and_read(layout: str, short: Sequence, tmp_path: Path) -> None:
+def test_each_layout_is_recognised_and_read(layout: str, short: Dataset, tmp_path: Path) -> None:
     write, format, timed, _, _ = LAYOUTS[layout]
     path = write(short, tmp_path / "set")
     source = open_recording(path)
@@ -63,7 +63,7 @@ def test_each_layout_is_recognised_and_read(layout: str, short: Sequence, tmp_pa
     assert open_recording(path, format).expected_frames == 5
 
 
-def test_warnings_of_an_interrupted_attempt_are_given_once(short: Sequence, tmp_path: Path) -> None:
+def test_warnings_of_an_interrupted_attempt_are_given_once(short: Dataset, tmp_path: Path) -> None:
     source = open_recording(seven_scenes(short, tmp_path / "set"))
     for _ in range(2):
         context = StageContext(RunFolder(tmp_path), source.path, Config(), tmp_path, SilentProgress())
@@ -72,7 +72,7 @@ def test_warnings_of_an_interrupted_attempt_are_given_once(short: Sequence, tmp_
         assert context.warnings.count("looks like panoramas") == 1
 
 
-def test_a_camera_of_a_file_is_fixed_and_one_of_the_kind_is_a_start(short: Sequence, tmp_path: Path) -> None:
+def test_a_camera_of_a_file_is_fixed_and_one_of_the_kind_is_a_start(short: Dataset, tmp_path: Path) -> None:
     path = seven_scenes(short, tmp_path / "set")
     context = StageContext(RunFolder(tmp_path), path, Config(), tmp_path, SilentProgress())
     camera, origin = known_camera(context, open_recording(path), None)
@@ -84,7 +84,7 @@ def test_a_camera_of_a_file_is_fixed_and_one_of_the_kind_is_a_start(short: Seque
 
 
 @pytest.mark.parametrize("layout", [name for name, row in LAYOUTS.items() if row[3]])
-def test_depth_and_labels_of_the_set_are_the_oracle(layout: str, short: Sequence, tmp_path: Path) -> None:
+def test_depth_and_labels_of_the_set_are_the_oracle(layout: str, short: Dataset, tmp_path: Path) -> None:
     write, _, _, _, has_labels = LAYOUTS[layout]
     path = write(short, tmp_path / "set")
     around = surroundings(path)
@@ -150,7 +150,7 @@ def test_maps_follow_the_lens(distortion: tuple[float, ...]) -> None:
     assert np.abs(ideal).max() > 2
 
 
-def test_a_folder_of_images_is_no_data_set_by_what_lies_beside_it(short: Sequence, tmp_path: Path) -> None:
+def test_a_folder_of_images_is_no_data_set_by_what_lies_beside_it(short: Dataset, tmp_path: Path) -> None:
     path = LAYOUTS["semantic_nerf"][0](short, tmp_path / "set")
     assert isinstance(open_recording(path / "rgb"), FolderRecording)
     seven = LAYOUTS["seven_scenes"][0](short, tmp_path / "seven")
@@ -170,7 +170,7 @@ def test_a_folder_of_images_is_no_data_set_by_what_lies_beside_it(short: Sequenc
 )
 @pytest.mark.parametrize("layout", ["colmap", "nerfstudio", "images", "frames"])
 def test_pictures_beside_the_images_do_not_hide_a_project(
-    layout: str, strays: list[str], short: Sequence, tmp_path: Path
+    layout: str, strays: list[str], short: Dataset, tmp_path: Path
 ) -> None:
     path = tmp_path / "project"
     LAYOUTS["nerfstudio" if layout == "nerfstudio" else "colmap"][0](short, path)
@@ -188,7 +188,7 @@ def test_pictures_beside_the_images_do_not_hide_a_project(
     assert isinstance(open_recording(path, "images"), FolderRecording)
 
 
-def test_a_damaged_first_image_does_not_cost_the_set(short: Sequence, tmp_path: Path) -> None:
+def test_a_damaged_first_image_does_not_cost_the_set(short: Dataset, tmp_path: Path) -> None:
     for layout in ("tum", "nerfstudio", "scannet", "colmap", "nice_slam", "seven_scenes"):
         path = LAYOUTS[layout][0](short, tmp_path / layout)
         first = open_sequence(path).image_paths[0]
@@ -199,12 +199,12 @@ def test_a_damaged_first_image_does_not_cost_the_set(short: Sequence, tmp_path: 
         assert "git-LFS" in "".join(warnings)
 
 
-def test_times_stay_those_of_the_set(short: Sequence, tmp_path: Path) -> None:
+def test_times_stay_those_of_the_set(short: Dataset, tmp_path: Path) -> None:
     source = open_recording(tum(short, tmp_path / "set"))
     assert next(iter(source.read())).timestamp == pytest.approx(START + short.timestamps[0], abs=1e-6)
 
 
-def test_a_data_set_is_reconstructed_with_what_it_knows(truth: Sequence, tmp_path: Path) -> None:
+def test_a_data_set_is_reconstructed_with_what_it_knows(truth: Dataset, tmp_path: Path) -> None:
     """TUM layout, nothing said but that its depth is wanted: its camera is taken, lengths are metres, times its own."""
     path, run = tum(truth, tmp_path / "set"), RunFolder(tmp_path / "set.msgs")
     config = load_config(overrides=["proxy.depth=files", "frames.rate=4", "run.threads=2"])

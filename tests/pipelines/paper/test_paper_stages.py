@@ -171,7 +171,7 @@ def test_a_frame_without_a_pose_measures_nothing(whole: RunFolder, monkeypatch: 
 def test_the_switch_changes_three_stages_and_what_proxies_are() -> None:
     default, chosen = all_stages(), all_stages("paper")
     assert [s.name for s in default] == [s.name for s in chosen]
-    rooms = [s.program.split()[1].split(".")[-3] for s in chosen]
+    rooms = [s.program.split()[-1].partition(".")[0] for s in chosen]
     assert rooms == ["frames", "proxy", "paper", "paper", "paper", "export"]
 
 

@@ -188,7 +188,7 @@ def test_an_export_with_a_guess_differs_in_words_only(run: RunFolder, tmp_path: 
     assert read_json(free / "scale.json") is None
     told = read_json(guessed / "scale.json")
     assert told["is_guess"]
-    assert "mean of its readings" in told["about_alone"]
+    assert "mean of its readings" in told["about_by_source"]
 
 
 # scenes of voxels ------------------------------------------------------------------------------------------------

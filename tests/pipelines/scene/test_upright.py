@@ -11,7 +11,7 @@ from finished import note_finished
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.datasets import Sequence
+from msgs_slam.formats.datasets import Dataset
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import ExportConfig
@@ -38,7 +38,7 @@ def run(oracle_run: OracleRun) -> RunFolder:
     return oracle_run(world_from_truth=MOVE)
 
 
-def test_the_room_stands_upright_on_its_floor(run: RunFolder, truth: Sequence) -> None:
+def test_the_room_stands_upright_on_its_floor(run: RunFolder, truth: Dataset) -> None:
     outcome = load_outcome(run)
     found = find_upright(outcome)
     assert found.source == "floor and upright lines"
