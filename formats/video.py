@@ -25,7 +25,7 @@ from .errors import InputError, install_extra
 from .images import IMAGE_SUFFIXES
 from .reading import opened, require_unicode
 from .video_clock import Clock, longest_step
-from .video_head import Track, main_track, read_tracks
+from .video_head import VideoTrack, main_track, read_tracks
 from .video_streams import AvCapture, StreamFacts, as_opencv_writes_them, has_pyav, read_facts, unreadable
 
 _SQUARE = 0.002
@@ -122,7 +122,7 @@ class VideoReader(Iterator[VideoFrame]):
         self._wanted = _as_predicate(wanted)
         self.tracks = read_tracks(self._path)
         self.track = main_track(self.tracks) if has_pyav() else 0
-        stated = self.tracks[self.track] if self.tracks else Track(0, 0)
+        stated = self.tracks[self.track] if self.tracks else VideoTrack(0, 0)
         facts = read_facts(self._path, _FIRST_FRAMES, self.track) if has_pyav() else StreamFacts()
         self.has_alpha = stated.has_alpha
         self.hdr = stated.transfer or facts.transfer
@@ -313,7 +313,7 @@ def _is_blank(image: NDArray) -> bool:
     return bool((some == image[0, 0]).all() and (image == image[0, 0]).all())
 
 
-def _read_display(capture: cv2.VideoCapture | AvCapture, track: Track) -> Display:
+def _read_display(capture: cv2.VideoCapture | AvCapture, track: VideoTrack) -> Display:
     mirror = mirror_of(track.matrix)
     if mirror.is_mirrored:
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # a decoder knows turns only, and turns such a picture by 180°
@@ -322,7 +322,7 @@ def _read_display(capture: cv2.VideoCapture | AvCapture, track: Track) -> Displa
     return replace(mirror, aspect=1 / aspect if is_turned else aspect)
 
 
-def _read_info(capture: cv2.VideoCapture | AvCapture, path: Path, display: Display, track: Track) -> VideoInfo:
+def _read_info(capture: cv2.VideoCapture | AvCapture, path: Path, display: Display, track: VideoTrack) -> VideoInfo:
     stored = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
     if min(stored) < 1:
         raise _undecodable(path)
@@ -379,8 +379,8 @@ class Display:
 
 
 def mirror_of(matrix: tuple[int, int, int, int]) -> Display:
-    """Return the Display of a matrix (a, b, c, d; see `Track`) that mirrors the picture; one that leaves all as it is
-    where it only turns, which decoders do."""
+    """Return the Display of a matrix (a, b, c, d; see `VideoTrack`) that mirrors the picture; one that leaves all as it
+    is where it only turns, which decoders do."""
     a, b, c, d = matrix
     if a * d - b * c >= 0:
         return Display()

@@ -113,7 +113,7 @@ class Outcome:
 
     @property
     def keyframe_psnr(self) -> float | None:
-        """See `keyframe_psnr`."""
+        """PSNR of the keyframes, dB, as `keyframe_psnr` finds it."""
         return keyframe_psnr(self.records)
 
     def require_map(self) -> GaussianMap:

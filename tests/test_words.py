@@ -104,7 +104,18 @@ def test_words_that_may_not_come_back(banned: str) -> None:
     assert found == [], f"better: {BANNED[banned]}"
 
 
-NO_PATHS = {"model.name", "name", "text", "EXTRACTOR", "model.family", "source", "kind", "s.name", "first"}
+NO_PATHS = {
+    "model.name",
+    "name",
+    "text",
+    "EXTRACTOR",
+    "model.family",
+    "source",
+    "kind",
+    "export.kind",
+    "s.name",
+    "first",
+}
 """Names of networks and words of the program's own."""
 
 
@@ -135,3 +146,33 @@ def test_paths_in_suggested_commands_are_quoted() -> None:
         for line, shown in unquoted_in_commands(ast.parse(path.read_text(encoding="utf-8")))
     ]
     assert found == []
+
+
+NOT_IN_NAMES = {"told", "looks", "looking", "picked", "alone", "beside", "nobody", "who"}
+
+
+def test_names_are_in_the_terms_of_the_field() -> None:
+    """Words of prose say nothing in the name of a function, class, argument or variable; one name for one thing."""
+    own_name: dict[str, list[str]] = {}
+    odd = []
+    for path in (p for room in ("msgs_cli", "pipelines", "formats") for p in sorted((ROOT / room).rglob("*.py"))):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in tree.body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                own_name.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
+        stored = (n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store))
+        defined = (n.name for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.ClassDef))
+        given = (n.arg for n in ast.walk(tree) if isinstance(n, ast.arg))
+        for name in {path.stem, *stored, *defined, *given}:
+            if NOT_IN_NAMES & set(re.sub("([A-Z])", r"_\1", name).lower().split("_")):
+                odd.append(f"{path.relative_to(ROOT)}: {name}")
+    twice = {name: where for name, where in own_name.items() if len(where) > 1 and name not in TWINS}
+    assert (odd, twice) == ([], {})
+
+
+TWINS = {
+    "class_weights", "composite", "depth_ratio", "inspect", "list_tiles", "match_planes", "fuse_depths", "project",
+    "render_all",  # the same step by numba and by Triton, or of one image and by a backend
+    "render",  # the command and the function that a program calls
+    "run",  # of every stage
+}  # fmt: skip

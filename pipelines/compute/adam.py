@@ -82,7 +82,7 @@ class AdamTable:
 
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor], prefix: str, keys: tuple[str, ...]) -> AdamTable:
-        """Inverse of `to_tensors`."""
+        """Return what `to_tensors` was given."""
         return AdamTable(
             {k: tensors[f"{prefix}.{k}"] for k in keys},
             {k: tensors[f"{prefix}.first.{k}"] for k in keys},

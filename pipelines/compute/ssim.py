@@ -68,5 +68,5 @@ def blur(image: Tensor) -> Tensor:
 
 
 def blur_array(image: NDArray, out: NDArray | None = None) -> NDArray:
-    """The same of an array, into `out` where it is given."""
+    """Blur an array, into `out` where it is given."""
     return cv2.sepFilter2D(image, -1, WINDOW, WINDOW, out, borderType=cv2.BORDER_CONSTANT).reshape(image.shape)

@@ -1,4 +1,4 @@
-"""What is exported: the outcome of a run in the world of its exported files, its metres decided."""
+"""Outcome of a run in the world of its exported files, its metres decided."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -43,7 +43,7 @@ class ExportScene:
 
     @property
     def metres_per_unit(self) -> float:
-        """How many metres a unit of the files is, 1 where that is unknown."""
+        """Metres per unit of the files, 1 where that is unknown."""
         return 1.0 if self.outcome.metric or self.outcome.metres is None else self.outcome.metres.per_unit
 
     def cloud(self, rows: Tensor | slice | None = None) -> GaussianCloud:

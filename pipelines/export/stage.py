@@ -70,7 +70,7 @@ class ExportStage:
         release_free_memory()
 
     def write(self, exports: Iterable[Export]) -> None:
-        """Write these kinds."""
+        """Write the kinds of files that the stage makes."""
         for export in exports:
             export.writer()(self.scene, self.target)
 

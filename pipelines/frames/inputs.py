@@ -1,4 +1,4 @@
-"""What is refused before the stage begins, and into which windows memory divides it.
+"""Checks before the stage begins, and the windows into which memory divides it.
 
 Imports nothing that computes.
 """

@@ -65,7 +65,7 @@ def photo_loss(shown: Tensor, exposure: Tensor, photo: Tensor, scene: Tensor | N
 
 
 def plain_photo_loss(shown: Tensor, exposure: Tensor, photo: Tensor, scene: Tensor | None) -> Tensor:
-    """The same by torch's own functions."""
+    """Return the photo loss by torch's own functions."""
     colors, target = expose(shown, exposure), photo.to(shown.dtype) / 255
     if scene is not None:
         own = colors.detach()

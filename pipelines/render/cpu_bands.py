@@ -63,7 +63,7 @@ def last_pixel(high: np.float32, size: int) -> np.int32:
 
 @dataclass(frozen=True)
 class ImageBands:
-    """What the bands of an image see. Band b sees the Gaussians entries[starts[b]:starts[b + 1]], near to far.
+    """Gaussians by the bands of an image that see them: band b sees entries[starts[b]:starts[b + 1]], near to far.
 
     first (M,): the first band of a Gaussian; slots (M + 1,): Gaussians in several bands own the places
     slots[i]:slots[i + 1], one a band, for what each of them has to say; prepared: per band its records and padded

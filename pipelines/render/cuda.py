@@ -205,7 +205,7 @@ def count_tiles(
     records: tl.tensor, touched: tl.tensor, width: tl.tensor, height: tl.tensor, count: tl.tensor,
     TILE: tl.constexpr, BLOCK: tl.constexpr,
 ) -> None:  # fmt: skip
-    """How many tiles each Gaussian may touch."""
+    """Count the tiles that each Gaussian may touch."""
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = row < count
     _, _, wide, tall, reach = tiles_around(records, row, inside, width, height, TILE)
@@ -214,7 +214,7 @@ def count_tiles(
 
 @triton.jit
 def entries_up_to(ascending: tl.tensor, count: tl.tensor, value: tl.tensor) -> tl.tensor:
-    """How many of the ascending numbers are at most each value, by halving."""
+    """Count the ascending numbers that are at most each value, by halving."""
     low = value * 0
     high = low + count
     while tl.max(high - low, axis=0) > 0:

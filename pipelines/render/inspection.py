@@ -51,7 +51,7 @@ def median_depth(
 def render_all(
     gaussian_map: GaussianMap, cam_from_world: Tensor, intrinsics: Intrinsics, backend: Backend = None
 ) -> Rendered:
-    """What a camera at (4, 4) sees of a map, by one walk over it on the CPU. No gradients."""
+    """Render what a camera at (4, 4) sees of a map, by one walk over it on the CPU. No gradients."""
     m, size = gaussian_map, (intrinsics.width, intrinsics.height)
     classes = m.class_logits.shape[1]
     if (module := _compiled(backend, m.means)) is not None:
@@ -89,7 +89,7 @@ def blending_weights(
     backend: Backend = None,
     counts: Tensor | None = None,
 ) -> BlendingWeights:
-    """What each of the M Gaussians contributes to the image of a camera: 0 where it is not seen at all. No gradients;
+    """Measure what each of the M Gaussians contributes to the image of a camera: 0 where it is not seen. No gradients;
     `counts` (H, W): what a pixel's weights count in the sums, None for 1; the others as in `render`."""
     return BlendingWeights(*_inspect(means, radii, opacities, cam_from_world, intrinsics, near, backend, counts)[1:])
 

@@ -1,4 +1,4 @@
-"""What every backend of the renderer agrees on, and what its backward pass finds about each Gaussian.
+"""Rules that every backend of the renderer keeps, and statistics that its backward pass gathers of each Gaussian.
 
 A Gaussian with opacity o and image radius s reaches the pixel centres at which f = o exp(-distance² / 2 s²) (MSGS-SLAM
 eq. 4, 5) is at least ALPHA_MIN and the distance at most CUT_SIGMAS s; there it counts with min(f, ALPHA_MAX). Gaussians

@@ -1,4 +1,4 @@
-"""What a stage reads, noted as it reads it: that and the program are the identity of its result.
+"""Notes of what a stage reads, taken as it reads: they and the program are the identity of its result.
 
 A stage is made again where a setting or a file that it has read is another by now. Settings are noted by the view of
 them that a stage is given (`watched`), files of earlier stages by the run folder, files of the user and networks by
@@ -45,9 +45,9 @@ _active: ContextVar[ReadLog | None] = ContextVar("_active", default=None)
 
 @dataclass(frozen=True)
 class Reads:
-    """What a stage has read. program: digest of what computed it; source: the source's digest; settings: section.key →
-    value; results: earlier stage → digest and names of its files ("" for its figures); files: path → sha256, of
-    a folder of its names, "" where there was nothing."""
+    """Everything that a stage has read. program: digest of what computed it; source: the source's digest; settings:
+    section.key → value; results: earlier stage → digest and names of its files ("" for its figures); files: path →
+    sha256, of a folder of its names, "" where there was nothing."""
 
     program: str = ""
     source: str = ""
@@ -81,7 +81,7 @@ class Reads:
 
 @dataclass(frozen=True)
 class Situation:
-    """What a stage would read by now: its program, the source, the settings, the earlier stages' results."""
+    """Everything that a stage would read by now: its program, the source, the settings, the earlier stages' results."""
 
     program: str
     source: str

@@ -1,4 +1,4 @@
-"""What holds the components of a path together: matches, shared points, and the covariance of an adjustment.
+"""Components of a path, and what holds each together: matches, shared points, and the covariance of an adjustment.
 
 The share of agreeing pairs over a whole model hides one bad place among hundreds of good ones: a seam looks only at
 what crosses between one keyframe and the next. Nor do reprojection errors tell whether poses are determined.

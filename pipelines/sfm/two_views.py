@@ -1,4 +1,4 @@
-"""What pairs of views tell before there is a model: the focal length, and whether the camera moved or only turned.
+"""Pairs of views before there is a model: the focal length, and whether the camera moved or only turned.
 
 Two views agree by a fundamental matrix whatever the focal length, but by a relative pose only at the right one. So the
 best relative pose of every pair is found at each of a row of focal lengths, and the one at which all pairs together

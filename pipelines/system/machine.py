@@ -1,4 +1,4 @@
-"""What this machine has for this process: its device, memory and CPUs, and the parts of a long recording that fit."""
+"""Resources of this machine: its device, memory and CPUs, and the parts of a long recording that fit."""
 
 import ctypes
 import functools
@@ -191,7 +191,7 @@ def require_device(wanted: str) -> None:
 
 
 def unused_card() -> tuple[str, str] | None:
-    """What is wrong with an NVIDIA card that is not used, and what to do; None where there is none, or where
+    """Explain why an NVIDIA card is not used, and what to do; None where there is none, or where
     CUDA_VISIBLE_DEVICES hides it."""
     import torch
 

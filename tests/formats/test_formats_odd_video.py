@@ -11,7 +11,7 @@ import pytest
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.video import VideoReader, pixel_aspect, probe_video
-from msgs_slam.formats.video_head import Track, main_track, read_equivalent, read_moov, read_tracks, video_sphere
+from msgs_slam.formats.video_head import VideoTrack, main_track, read_equivalent, read_moov, read_tracks, video_sphere
 from msgs_slam.formats.video_streams import AvCapture
 from msgs_slam.pipelines.source.recording import VideoRecording
 from tests.formats.test_formats_video import encode, hdr_signal, textured, with_matrix, woven, write_hdr
@@ -365,7 +365,7 @@ def test_the_main_track_is_read_and_the_other_named(
 
 
 def test_the_main_track_is_the_marked_one_else_the_largest() -> None:
-    small, large, cover = Track(64, 48), Track(96, 64), Track(4000, 3000, samples=1)
+    small, large, cover = VideoTrack(64, 48), VideoTrack(96, 64), VideoTrack(4000, 3000, samples=1)
     assert main_track([]) == main_track([small]) == main_track([large, large]) == 0
     assert main_track([small, large, cover]) == 1
     assert main_track([replace(large, is_default=False), small]) == 1
