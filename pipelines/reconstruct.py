@@ -11,7 +11,7 @@ from ..formats.video import probe_video
 from .config import GPS_AUTO, GPS_OFF, SOURCE_LIST, STAGES, Config
 from .frames.inputs import check_frames, frames_division
 from .mapping.division import mapping_division
-from .proxy.selection import check_proxy
+from .proxy.selection import check_proxy, choose_depth, choose_semantics
 from .read_config import with_absolute_paths
 from .run.folder import RunFolder, load_records, load_settings, load_source
 from .run.lock import LOCK, SOFT_LOCK, locked, make_folder
@@ -116,9 +116,10 @@ def reconstruct(
     require_unicode(source.resolve())  # the manifest names it
     require_unicode(run.root.absolute())
     config = with_absolute_paths(config)
-    digest = open_recording(source, config.run.format).digest
     _require_run_or_empty(run)
+    digest = open_recording(source, config.run.format).digest
     require_device(config.run.device)  # refused before anything is written
+    choose_depth(config.proxy), choose_semantics(config.proxy)  # a mistyped name waits for no library
     with locked(run):
         _require_same_source(run, source, digest, config.run.format)
         return _run(run, source.resolve(), digest, config, progress, until, workers, threads)

@@ -183,8 +183,8 @@ def run_of(out: Path, digest: str = "0") -> RunFolder:
 def test_run_of_another_source_is_not_touched(tmp_path: Path) -> None:
     out = tmp_path / "run"
     manifest = run_of(out).manifest_file.read_bytes()
-    source = tmp_path / "video.mp4"
-    source.write_text("x")
+    source = tmp_path / "video.avi"
+    write_video(source, list(np.random.default_rng(0).integers(0, 255, (5, 48, 64, 3), np.uint8)), 10.0)
     message = refused(source, out)
     assert "another source" in message
     assert "--out" in message
