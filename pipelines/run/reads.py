@@ -123,7 +123,8 @@ class ReadLog:
     in `folder`. Settings are noted with the values of `config`, whatever a task makes of them."""
 
     def __init__(self, root: Path, folder: Path, config: Config) -> None:
-        self._root, self._folder, self.config = root.absolute(), folder, config
+        self._root, self._folder = root.absolute(), folder
+        self.config = replace(config, **{f.name: _plain(getattr(config, f.name)) for f in fields(config)})
         self._seen = set(_entries(folder)) if (folder / LOGS).is_dir() else set()
         self._covered: set[str] = set()
         self._lock = Lock()
@@ -256,7 +257,14 @@ def watched(config: Config) -> Config:
     return replace(config, **{f.name: _view(f.name, getattr(config, f.name)) for f in fields(config)})
 
 
+def _plain(values: T) -> T:
+    """Return a section whose reads are not noted, of one or of a view of one: a stage that runs stages has views."""
+    cls: type[T] = getattr(type(values), "plain_class", type(values))
+    return cls(**vars(values))
+
+
 def _view(section: str, values: T) -> T:
+    values = _plain(values)
     cls = _view_class(section, type(values))  # type: ignore[arg-type]
     view: T = object.__new__(cls)
     vars(view).update(vars(values))
@@ -272,14 +280,12 @@ def _view_class(section: str, cls: type[T]) -> type[T]:
             log.note("settings", f"{section}.{name}", lambda: _setting(log.config, f"{section}.{name}"))
         return object.__getattribute__(view, name)
 
-    def plain(view: T) -> T:
-        return cls(**vars(view))
-
     changed = {
+        "plain_class": cls,
         "__getattribute__": get,
-        "__reduce__": lambda view: (_view, (section, plain(view))),
+        "__reduce__": lambda view: (_view, (section, _plain(view))),
         "__eq__": lambda view, other: isinstance(other, cls) and vars(view) == vars(other),
-        "__hash__": lambda view: hash(plain(view)),
+        "__hash__": lambda view: hash(_plain(view)),
         "__module__": cls.__module__,
     }
     return type(cls.__name__, (cls,), changed)

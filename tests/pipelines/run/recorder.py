@@ -38,7 +38,7 @@ class Recorder:
     def _make(self, name: str) -> Callable[[StageContext], dict[str, Any]]:
         def run(context: StageContext) -> dict[str, Any]:
             self.ran.append(name)
-            own = f"{getattr(context.config, name)} {context.config.run.seed}"
+            own = f"{getattr(context.config, name, '')} {context.config.run.seed}"
             before = STAGES[STAGES.index(name) - 1] if name != STAGES[0] else None
             text = context.run.file(before, "result.txt").read_text() if before else "source"
             write_text(context.snapshot / "half.txt", "half")

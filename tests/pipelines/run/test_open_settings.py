@@ -51,6 +51,7 @@ def source(tmp_path: Path) -> Path:
 
 def with_gpu(monkeypatch: pytest.MonkeyPatch, there: bool) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: there)
+    monkeypatch.setattr("torch.cuda.get_device_capability", lambda: (9, 0))
 
 
 def test_a_run_begun_on_a_gpu_goes_on_without_one(

@@ -266,6 +266,25 @@ def test_only_what_a_stage_reads_makes_it_again(recorder: Recorder, tmp_path: Pa
     assert not bring("frames.rate=5", "mapping.submap=9")
 
 
+def test_a_stage_can_run_stages_with_the_settings_that_it_is_given(recorder: Recorder, tmp_path: Path) -> None:
+    """They note what they read, and a setting that one of them has read makes it and the stage around it again."""
+    within = Recorder()
+
+    def run(context: StageContext) -> dict[str, Any]:
+        recorder.ran.append("export")
+        within.bring(tmp_path / "r" / "within", context.config)
+        return {}
+
+    stages = [*recorder.stages()[:-1], Stage("export", run)]
+    assert recorder.bring(tmp_path / "r", stages=stages) == within.ran == list(STAGES)
+    for folder in (tmp_path / "r", tmp_path / "r" / "within"):
+        assert load_records(RunFolder(folder))["frames"].reads.settings["frames.rate"] == Config().frames.rate
+    assert recorder.bring(tmp_path / "r", stages=stages) == []
+    other = load_config(overrides=["mapping.hold_out=4"])
+    assert recorder.bring(tmp_path / "r", other, stages=stages) == ["mapping", "global_ba", "export"]
+    assert within.ran == ["mapping", "global_ba", "export"]
+
+
 def test_unfinished_work_goes_on_unless_something_that_it_has_read_has_changed(
     recorder: Recorder, tmp_path: Path
 ) -> None:
