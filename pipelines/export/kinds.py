@@ -173,8 +173,7 @@ EXPORTS = (
                 "Blender, game engines, the web",
             ),
         ),
-        "mesh.write_mesh", settings=("voxel", "max_blocks", "mesh_side", "planes", "texture"), when="always",
-        also=("texture",),
+        "mesh.write_mesh", settings=("voxel", "planes", "texture"), when="always", also=("texture",),
     ),
     Export(
         "collision", "a light mesh to walk in",

@@ -172,7 +172,7 @@ def _require_free(run: RunFolder, folder: Path, names: set[str]) -> None:
     if inside.is_relative_to(around.resolve()) and EXPORTS_FOLDER not in inside.relative_to(around.resolve()).parts:
         raise InputError(
             f"{folder} belongs to the run, whose stages write there: leave --to out, for "
-            f"{run.root / EXPORTS_FOLDER}, or name a folder outside of the run"
+            f"{run.path(EXPORTS_FOLDER)}, or name a folder outside of the run"
         )
 
 

@@ -257,12 +257,6 @@ def test_damaged_manifest_is_refused(tmp_path: Path) -> None:
             assert "msgs-slam reconstruct" in result.stderr
 
 
-def test_export_with_other_settings_must_say_where_to(tmp_path: Path) -> None:
-    result = invoke("export", tmp_path, "--set", "export.voxel=0.02")
-    assert result.exit_code == 2
-    assert "--to" in result.stderr
-
-
 @pytest.mark.parametrize(
     ("words", "reason"),
     [

@@ -410,7 +410,7 @@ def make_head(folder: Path) -> None:
 def make_tokenizer(folder: Path) -> None:
     """Byte-level BPE with CLIP's normaliser and end of words, which knows a few words."""
     tokenizer = Tokenizer(tokenizer_models.BPE(unk_token="?", end_of_word_suffix="</w>"))
-    tokenizer.normalizer = normalizers.Dataset([normalizers.NFC(), normalizers.Lowercase()])
+    tokenizer.normalizer = normalizers.Sequence([normalizers.NFC(), normalizers.Lowercase()])
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     trainer = trainers.BpeTrainer(special_tokens=["?"], end_of_word_suffix="</w>", vocab_size=120, show_progress=False)
     tokenizer.train_from_iterator(["a photo of a lamp and a sofa, a lamp"], trainer)
@@ -453,7 +453,13 @@ CAMERAS_XML = (
     + "</cameras></chunk></document>"
 )
 SHOTS = {f"{i}.jpg": {"rotation": [0, 0.1, i], "translation": [i, 0, 1]} for i in range(4)}
-SFM = {"width": "640", "height": "480", "sensorWidth": "36", "focalLength": "28", "type": "radial3"}
+OPENCV_XML = (
+    '<?xml version="1.0"?><opencv_storage><image_width>640</image_width><image_height>480</image_height>'
+    '<camera_matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>'
+    "<data>500 0 320 0 501 240 0 0 1</data></camera_matrix>"
+    '<distortion_coefficients type_id="opencv-matrix"><rows>1</rows><cols>5</cols><dt>d</dt>'
+    "<data>-0.1 0.01 0 0 0</data></distortion_coefficients></opencv_storage>"
+)
 SUBTITLES = "".join(
     f"{i}\n00:00:0{i},000 --> 00:00:0{i},900\n[latitude: 48.{i}] [longitude: 11.{i}] [rel_alt: 1 abs_alt: 5{i}]\n\n"
     for i in range(5)
@@ -511,12 +517,8 @@ DOORS: dict[str, Door] = {
         text("ros.yaml", "camera_matrix:\n  data: [500, 0, 320, 0, 501, 240, 0, 0, 1]\n"),
         lambda p: judge_camera(read_intrinsics(str(p), 640, 480)), "ros.yaml", in_text,
     ),
-    "--intrinsics XML": Door(
-        text("a.xml", CAMERAS_XML), lambda p: judge_camera(read_intrinsics(str(p), 640, 480)), "a.xml", in_text,
-    ),
-    "--intrinsics of Meshroom": Door(
-        lambda f: write_json(f / "cameras.sfm", {"intrinsics": [SFM]}),
-        lambda p: judge_camera(read_intrinsics(str(p), 640, 480)), "cameras.sfm", in_json,
+    "--intrinsics, OpenCV's XML": Door(
+        text("a.xml", OPENCV_XML), lambda p: judge_camera(read_intrinsics(str(p), 640, 480)), "a.xml", in_text,
     ),
     "class table, JSON": Door(make_truth, read_class_table, "classes.json", in_json, "classes.json"),
     "class table, text": Door(text("labels.txt", "0 wall x\n1 sofa\n2 floor\n"), read_class_table, "labels.txt"),

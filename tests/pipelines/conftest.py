@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import trimesh
 from finished import note_finished
 from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.formats.images import write_rgb
+from msgs_slam.formats.mesh import MeshBlocks, write_mesh_ply
 from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.config import Config, MappingConfig
 from msgs_slam.pipelines.geometry.se3 import Similarity
@@ -58,7 +58,7 @@ def oracle_run(truth: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Orac
         TRAJECTORY.save(run.stage("mapping"), trajectory)
         write_json(run.stage("mapping") / "mapping.json", {"class_ids": class_ids})
         if mesh:
-            _write_mesh(run.stage("export") / "mesh.ply", gaussian_map)
+            _write_mesh(run.stage("export") / "mesh.ply", gaussian_map, class_ids)
         config = Config(mapping=MappingConfig(hold_out=hold_out))
         source = "walk.mp4" if video else str(truth.root / "rgb")
         note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"), config, source, seconds=2.0)
@@ -149,11 +149,14 @@ def _seeded_map(truth: Dataset, move: Similarity, stride: int) -> tuple[Gaussian
     ), class_ids
 
 
-def _write_mesh(path: Path, gaussian_map: GaussianMap) -> None:
-    """A small triangle at every fifth Gaussian."""
+def _write_mesh(path: Path, gaussian_map: GaussianMap, class_ids: list[int]) -> None:
+    """A small triangle at every fifth Gaussian, in its colour and of its class."""
     means = gaussian_map.means.numpy()[::5].astype(np.float64)
     size = 1e-3
     corners = means[:, None] + size * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]])
-    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(means)).reshape(-1, 3), process=False)
+    points, faces = corners.reshape(-1, 3).astype(np.float32), np.arange(3 * len(means), dtype=np.int32).reshape(-1, 3)
+    colors = np.rint(255 * gaussian_map.colors.numpy()[::5]).clip(0, 255).astype(np.uint8)
+    labels = np.array(class_ids, np.uint8)[gaussian_map.class_logits.numpy()[::5].argmax(1)]
+    vertices = (points, np.repeat(colors, 3, axis=0), np.repeat(labels, 3))
     path.parent.mkdir(parents=True)
-    mesh.export(path)
+    write_mesh_ply(path, MeshBlocks(len(points), len(faces), lambda: [vertices], lambda: [faces]))

@@ -19,6 +19,7 @@ import msgs_slam
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.trajectory import read_tum
+from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.run.files import FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings
@@ -59,14 +60,17 @@ def test_the_readers_on_the_page_read_an_export(
     oracle_run: OracleRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = oracle_run(pixel_stride=6)
-    for kind in ("ply", "tum"):
-        export_run(run, tmp_path / "video.msgs" / "export", kind)
+    for kind in ("mesh", "tum"):
+        export_run(run, tmp_path / "video.msgs" / "export", kind, settings=ExportConfig(voxel=0.05, texture=False))
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
     code = next(b for b in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "read_tum" in b)
     found: dict[str, Any] = {}
     exec(code, found)
-    assert len(found["cloud"]) == len(found["cloud"].class_ids) > 1000
+    mesh = found["mesh"]
+    assert len(mesh.vertices) == len(mesh.colors) == len(mesh.labels) > 1000
+    assert 1000 < mesh.faces.max() < len(mesh.vertices)
+    assert len(np.unique(mesh.labels)) > 2
     assert found["world_from_cam"].shape == (len(found["seconds"]), 4, 4)
 
 

@@ -1,6 +1,7 @@
 """The exported files of a run, read by other programs' libraries."""
 
 import inspect
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -251,6 +252,24 @@ def test_what_is_asked_for_has_a_folder_that_no_stage_touches(oracle_run: Oracle
             export_run(run, own, "tum")
     with locked(run):
         export_run(RunFolder(run.root), only="tum", settings=ExportConfig(axes="first"))
+
+
+def test_other_settings_hold_for_what_is_asked_for_alone(oracle_run: OracleRun) -> None:
+    """`export --set` without --to: the files of the run itself stay byte for byte, and its settings too."""
+    run = oracle_run(video=True)
+    export_run(run, only="tum")
+
+    def contents() -> dict[Path, bytes]:
+        files = [p for p in run.root.rglob("*") if p.is_file() and p.name != ".lock"]
+        return {p: p.read_bytes() for p in files if not p.is_relative_to(run.root / "exports")}
+
+    before, upright = contents(), (run.root / "exports" / "tum" / "trajectory.txt").read_bytes()
+    done = CliRunner().invoke(main, ["export", str(run.root), "--only", "tum", "--set", "export.axes=first"])
+    assert done.exit_code == 0, done.output
+    assert str(run.root / "exports" / "tum" / "trajectory.txt") in done.output.replace("\n", "")
+    assert json.loads((run.root / "exports" / "tum" / "world.json").read_text())["axes"] == "first"
+    assert (run.root / "exports" / "tum" / "trajectory.txt").read_bytes() != upright
+    assert contents() == before
 
 
 def test_a_run_without_a_map_is_refused(oracle_run: OracleRun, tmp_path: Path) -> None:
