@@ -33,6 +33,8 @@ LABELS = (
     'task="segmentation"\nmodel="net.onnx"\ninput="x"\noutput="y"\nkind="logits"\nclasses=["wall","floor","table"]\n'
 )
 MACHINE = {"run.threads", "run.device", "run.memory_mb"}
+UNREAD = {"run.kappa", "run.quality", *MACHINE}  # of the paper's method; asked for before a stage runs; of the machine
+READ_BY = {"proxy.moving": {"proxy"}, "mapping.hold_out": {"mapping"}, "frames.rate": {"frames", "global_ba"}}
 _running: list[str] = []
 _opened: dict[str, set[Path]] = defaultdict(set)
 
@@ -154,12 +156,16 @@ def test_any_byte_of_an_earlier_stage_changes_the_stages_that_have_opened_it_and
 
 
 def test_a_file_that_was_looked_for_counts_as_read(world: World) -> None:
-    records = world.records
-    without = {**records["frames"].files}
-    assert "backbone/model.npz" in without
-    found = {**records["proxy"].files, "descriptors.npz": (1, "new")}
-    assert "descriptors.npz" not in records["proxy"].files
-    assert world.changed(records={**records, "proxy": replace(records["proxy"], files=found)}) == {"global_ba"}
+    expected = {
+        ("frames", "masks/000005.jpg.png"): {"proxy", "mapping", "export"},  # a mask of another frame was given
+        ("proxy", "masks/000005.jpg.png"): {"mapping", "export"},  # nothing has moved
+        ("tracking", "piece_2/sparse.npz"): {"export"},
+    }
+    for (stage, name), readers in expected.items():
+        record = world.records[stage]
+        assert name not in record.files
+        found = replace(record, files={**record.files, name: (1, "new")})
+        assert world.changed(records={**world.records, stage: found}) == readers, (stage, name)
 
 
 def test_settings_that_were_not_asked_for_change_nothing(world: World) -> None:
@@ -176,8 +182,8 @@ def test_settings_that_were_not_asked_for_change_nothing(world: World) -> None:
             for stage in changed:
                 counts[stage] += 1
     assert min(counts.values()) > 1
-    unread = {"proxy.stereo_side", "run.kappa"}  # depth is given
-    assert not unread & {name for record in world.records.values() for name in record.reads.settings}
+    read_in = {name: {s for s, r in world.records.items() if name in r.reads.settings} for name in {*UNREAD, *READ_BY}}
+    assert read_in == {**{name: set() for name in UNREAD}, **READ_BY}
 
 
 def table_of_files(*runs: dict[str, StageRecord]) -> str:
