@@ -37,7 +37,7 @@ LEARNED_SPREAD = 0.02
 """Files whose depths stray by more from the triangulated points, relatively and within one frame, are taken for a
 network's. Measured: true depth 0.004, two models of a network 0.056 and 0.059."""
 _FILES_LOOKED_AT = 12
-STEREO_PLANES, _PIXELS_A_PLANE = 128, 5
+STEREO_PLANES, _LEAST_PLANES, _PIXELS_A_PLANE = 128, 32, 5
 """Depths that multiview tries: at most so many, and fewer in small images, where more lie within a pixel."""
 CACHE_MB = 2000
 """Megabytes of results of networks that are kept over runs."""
@@ -226,7 +226,7 @@ def _multiview(around: ProviderContext) -> MultiviewDepth:
     from ..depth.stereo.provider import MultiviewDepth
 
     side = around.config.stereo_side
-    planes = min(STEREO_PLANES, side // _PIXELS_A_PLANE)
+    planes = min(STEREO_PLANES, max(_LEAST_PLANES, side // _PIXELS_A_PLANE))
     return MultiviewDepth(
         around.sequence, side, planes, lambda: around.scratch("stereo"), around.threads, around.progress, around.device
     )
