@@ -1,5 +1,6 @@
 """Shared fixtures."""
 
+import gc
 import logging
 import sys
 from collections.abc import Iterator
@@ -35,6 +36,13 @@ def _no_networks_of_the_user(tmp_path_factory: pytest.TempPathFactory) -> Iterat
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MSGS_SLAM_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _objects_of_earlier_files_are_not_traced_again() -> None:
+    """Every stage collects garbage once, which takes seconds where hundreds of tests have left their objects."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)
