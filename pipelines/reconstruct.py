@@ -11,7 +11,7 @@ from ..formats.video import probe_video
 from .config import GPS_AUTO, GPS_OFF, SOURCE_LIST, STAGES, Config
 from .frames.inputs import check_frames, frames_division
 from .mapping.division import mapping_division
-from .proxy.selection import check_proxy, choose_depth, choose_semantics
+from .proxy.selection import check_proxy, choose_providers
 from .read_config import with_absolute_paths
 from .run.folder import RunFolder, load_records, load_settings, load_source
 from .run.lock import LOCK, SOFT_LOCK, locked, make_folder
@@ -38,7 +38,7 @@ def all_stages(method: str = "default") -> list[Stage]:
         between = [Stage(stage, Later("paper.stages", name)) for stage, name in names.items()]
     return [
         Stage("frames", Later("frames.stage"), check_frames, frames_division),
-        Stage("proxy", Later("proxy.stage"), check_proxy),
+        Stage("proxy", Later("proxy.stage"), check_proxy, check_settings=choose_providers),
         *between,
         Stage("export", Later("export.stage"), _check_export),
     ]
@@ -119,7 +119,6 @@ def reconstruct(
     _require_run_or_empty(run)
     digest = open_recording(source, config.run.format).digest
     require_device(config.run.device)  # refused before anything is written
-    choose_depth(config.proxy), choose_semantics(config.proxy)  # a mistyped name waits for no library
     with locked(run):
         _require_same_source(run, source, digest, config.run.format)
         return _run(run, source.resolve(), digest, config, progress, until, workers, threads)

@@ -226,11 +226,12 @@ class FramesStage:
         context, folder = self.context, self.context.folder
 
         def write(frame: Frame) -> None:
-            whole = lossless_image_path(context, frame.name)
             if self.lens.is_straight:
                 copy_file(selected_image_path(context, frame.name), folder / frame.name)
             else:
-                write_rgb(folder / frame.name, self.lens.undistort_image(read_rgb(whole)))
+                write_rgb(
+                    folder / frame.name, self.lens.undistort_image(read_rgb(lossless_image_path(context, frame.name)))
+                )
 
         missing = [f for f in self.frames if not (folder / f.name).exists()]
         done = parallel_map(write, missing, context.threads)

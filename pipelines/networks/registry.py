@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import functools
+import logging
 import os
 import re
 import shutil
@@ -349,13 +350,14 @@ def _fetch_one(url: str, target: Path, size: int, sha256: str, progress: Callabl
     import pooch
     import requests
 
+    pooch.get_logger().setLevel(logging.WARNING)
     known, reason = f"sha256:{sha256}" if sha256 else None, ""
     for _ in range(_ATTEMPTS):
         downloader = pooch.HTTPDownloader(
             progressbar=_Bar(size, progress), chunk_size=_CHUNK, timeout=_TIMEOUT, hooks={"response": _require_safe}
         )
         try:
-            pooch.core.stream_download(url, target, known, downloader)
+            pooch.retrieve(url, known, target.name, target.parent, downloader=downloader)
             return ""
         except requests.HTTPError as error:
             return f"the server answers {str(error).partition(' for url')[0]}"

@@ -113,6 +113,11 @@ def choose_semantics(config: ProxyConfig) -> Choice:
     return replace(choice, card=with_words(choice.card, config.classes))
 
 
+def choose_providers(config: Config) -> tuple[Choice, Choice]:
+    """Return those of depth and labels. Raises InputError as `choose_depth` and `choose_semantics` do."""
+    return choose_depth(config.proxy), choose_semantics(config.proxy)
+
+
 def _choose(text: str, setting: str, own: tuple[str, ...], task: str) -> Choice:
     kind, rest = split_choice(text, setting, (*AUTO, *own, "files", "onnx"))
     card = _cached(task, kind == "best") if kind in AUTO else _read(rest) if kind == "onnx" else None
@@ -270,7 +275,7 @@ def check_proxy(source: Path, config: Config) -> None:
         raise InputError("--scale-ref poses needs poses: give them with --poses FILE|FOLDER")
     if config.proxy.scale_ref:
         require_reference_in(open_recording(source, config.run.format), config.proxy.scale_ref)
-    depth, semantics = choose_depth(config.proxy), choose_semantics(config.proxy)
+    depth, semantics = choose_providers(config)
     if config.proxy.semantics == "auto" and (line := missing_networks()):
         log.warning(line)
     if not {depth.kind, semantics.kind} & {"files", "onnx"}:

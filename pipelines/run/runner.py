@@ -197,6 +197,8 @@ def _check(
         settled = False
         if stage is stages[0]:
             same_source()
+        if stage.check_settings:
+            stage.check_settings(config)
         if stage.check:
             checks.append(stage.check)
     for check in checks:  # these open networks and read files, which takes longer than what is refused above

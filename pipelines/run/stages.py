@@ -131,7 +131,8 @@ class Stage:
     """`run` does the work and returns its key figures.
 
     `check` refuses files and networks that it could not use: it sees (source, config) before the first stage runs, so
-    that a mistake is told of before anything slow. `division`: into which parts the work of a finished stage is divided
+    that a mistake is told of before anything slow. `check_settings` refuses what the settings alone show to be wrong,
+    before any `check` loads libraries. `division`: into which parts the work of a finished stage is divided
     with these settings, where the memory that is given decides that and the result with it.
     """
 
@@ -139,6 +140,7 @@ class Stage:
     run: Callable[[StageContext], dict[str, Any]]
     check: Callable[[Path, Config], None] | None = None
     division: Callable[[RunFolder, Config], Any] | None = None
+    check_settings: Callable[[Config], Any] | None = None
 
     @property
     def program(self) -> str:

@@ -220,6 +220,30 @@ def test_what_a_stage_could_not_use_is_refused_first_and_other_files_make_it_aga
     assert recorder.ran == []
 
 
+def test_settings_by_themselves_are_refused_before_any_check_and_where_the_stage_has_work(
+    recorder: Recorder, tmp_path: Path
+) -> None:
+    card = tmp_path / "card.toml"
+    checked: list[str] = []
+
+    def check_settings(config: Config) -> None:
+        if not card.exists():
+            raise InputError(f"{card} is not there")
+
+    stages = recorder.stages()
+    stages[0] = replace(stages[0], check=lambda source, config: checked.append("frames"))
+    stages[1] = replace(stages[1], check_settings=check_settings)
+    bring = partial(recorder.bring, tmp_path / "r", stages=stages)
+    with pytest.raises(InputError, match="is not there"):
+        bring()
+    assert (recorder.ran, checked) == ([], [])
+    card.touch()
+    assert bring() == list(STAGES)
+    assert checked == ["frames"]
+    card.unlink()
+    assert bring() == [], "what is finished stays"
+
+
 def test_memory_that_divides_a_stage_otherwise_makes_it_again(recorder: Recorder, tmp_path: Path) -> None:
     """And only then: where the parts are the same, the result is."""
     stages = recorder.stages()
