@@ -52,10 +52,10 @@ class KeyframeChoice:
 def choose_keyframes(
     frames: Iterable[tuple[NDArray[np.uint8], NDArray[np.bool_] | None]], parallax: float
 ) -> KeyframeChoice:
-    """Keyframes of grey frames (H, W) in order of time, each with a mask (H, W) of what is no part of the scene: one
-    whenever points have moved by `parallax`, as a fraction of the width for
-    what goes sideways and of the height for what goes up, since either takes as much of the overlap; the first, and the
-    last where it adds a view.
+    """Choose keyframes of grey frames (H, W) in order of time, each with a mask (H, W) of what is no part of the scene.
+
+    They are the first, one whenever points have moved by `parallax`, and the last where it adds a view. Motion counts
+    as a fraction of the width sideways and of the height upwards: either takes as much of the overlap.
     """
     tracker = _Tracker()
     keyframes: list[int] = []

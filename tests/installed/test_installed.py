@@ -123,16 +123,6 @@ def test_a_finished_run_is_up_to_date(demo: Path) -> None:
     assert {p: p.stat().st_mtime_ns for n in STAGES for p in (demo / n).rglob("*")} == before
 
 
-def test_two_processes_share_a_run(demo: Path, tmp_path: Path) -> None:
-    shared = tmp_path / "shared.msgs"
-    shutil.copytree(demo, shared)
-    shutil.rmtree(shared / "export")
-    words = [str(PROGRAM), "work", shared.name, "-q", "--shard"]
-    workers = [subprocess.Popen([*words, f"{k}/2"], cwd=tmp_path, env=environment()) for k in range(2)]
-    assert [w.wait(timeout=600) for w in workers] == [0, 0]
-    assert (shared / "export" / "mesh.ply").read_bytes() == (demo / "export" / "mesh.ply").read_bytes()
-
-
 def test_ray_is_a_place_to_work(demo: Path, tmp_path: Path) -> None:
     pytest.importorskip("ray")
     other = tmp_path / "ray.msgs"
