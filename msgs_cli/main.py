@@ -332,7 +332,7 @@ def demo(
 ) -> None:
     """Reconstruct a synthetic test clip and print its errors against ground truth."""
     config = chosen_config(config_file, overrides, given)
-    from ..pipelines.evaluation.demo import demo_summary, run_demo
+    from ..pipelines.evaluation.write import demo_summary, run_demo
     from ..pipelines.reconstruct import reconstruct
     from ..pipelines.run.folder import RunFolder
 

@@ -30,7 +30,7 @@ from .truth import (
     match_outcome,
     relative_error,
 )
-from .views import MapView, render_outcome
+from .views import render_outcome
 
 KEYFRAMES, BETWEEN, HELD_OUT = "keyframes", "between", "held out"
 AT_TRUE_POSES, AT_REFINED_POSES = " at true poses", " at refined poses"
@@ -41,7 +41,7 @@ SLOPE_PX, NOISE, MAX_STEPS = 0.2, 0.02, 10
 In a room of noise 0.02, from 1 cm and 0.3 degrees: within 0.15 mm of the true pose after 7 steps."""
 
 FREE_UNIT = "units of the truth"
-FREE_TRUTH = "the truth's poses have no metric scale"
+FREE_TRUTH, FREE_RUN = "the truth's poses have no metric scale", "the run has no metric scale"
 
 PROTOCOL = (
     "Frames belong to the truth of the same {by}; the other frames count as picked and posed only.",
@@ -91,8 +91,11 @@ def evaluate_outcome(
     why = {"missing": f"mapping is not done; the last stage is {outcome.pose_stage}"}
     of_map: dict[str, Any] = {"images": why, "depth": why, "labels": why, "views": []}
     if outcome.gaussian_map is not None:
-        measured = measure_views(outcome, matched, alignment, matching, progress or SilentProgress(), max_views)
-        of_map = measured.cells(outcome, matched)
+        measured = Measured(outcome, matched, matching)
+        jobs = _jobs(outcome, matched, alignment, max_views)
+        for job in (progress or SilentProgress()).track(jobs, "measuring", len(jobs)):
+            measured.add(*job)
+        of_map = measured.cells()
     result = {
         "run": outcome.run.place.name,
         "truth": f"{truth.root.name} ({truth.format})",
@@ -156,12 +159,17 @@ def trajectory_cells(outcome: Outcome, matched: MatchedTruth) -> tuple[dict[str,
     is_metric = outcome.metric and matched.sequence.metric
     if not is_metric:
         for key in [key for key in cells if key.startswith("se3")]:
-            cells[key] = {"missing": FREE_TRUTH if outcome.metric else "the run has no metric scale"}
+            cells[key] = {"missing": FREE_TRUTH if outcome.metric else FREE_RUN}
     try:
         sim3 = absolute_error(estimate[usable, :3, 3], truth[usable, :3, 3], with_scale=True)
     except ValueError as error:
         return {"missing": str(error)}, None
-    cells["rpe"] = _rpe(estimate[usable], truth[usable], sim3.alignment.scale)
+    rpe = relative_error(estimate[usable], truth[usable], 1, sim3.alignment.scale)
+    cells["rpe"] = {
+        "translation rmse": ErrorStatistics.of(rpe.translation).rmse,
+        "rotation rmse degrees": ErrorStatistics.of(rpe.rotation).rmse,
+        "pairs": len(rpe.rotation),
+    }
     best = absolute_error(estimate[usable, :3, 3], truth[usable, :3, 3], False) if is_metric else sim3
     return cells, best
 
@@ -205,12 +213,6 @@ def _ate_of_every(every: Trajectory, sequence: Dataset, with_scale: bool) -> dic
     return _ate(every.centers[rows], truth.world_from_cam[rows, :3, 3], with_scale)
 
 
-def _rpe(estimate: NDArray, truth: NDArray, scale: float) -> dict[str, Any]:
-    error = relative_error(estimate, truth, 1, scale)
-    translation, rotation = ErrorStatistics.of(error.translation), ErrorStatistics.of(error.rotation)
-    return {"translation rmse": translation.rmse, "rotation rmse degrees": rotation.rmse, "pairs": len(error.rotation)}
-
-
 def cost_cells(outcome: Outcome) -> dict[str, Any]:
     """Seconds of each stage, frames a second over all of them, peak memory, size of the map."""
     seconds = {name: record.seconds for name, record in outcome.records.items()}
@@ -250,72 +252,79 @@ class MeasuredView:
 
 
 class Measured:
-    """Sums over the views of a run."""
+    """Sums over the views of a run: keyframes, held-out frames and frames between at the run's own poses; held-out
+    frames also at poses refined on the map, and frames not used for the map at the true ones."""
 
-    def __init__(self, names: tuple[str, ...], true_names: tuple[str, ...], matching: Matching | None) -> None:
+    def __init__(self, outcome: Outcome, matched: MatchedTruth, matching: Matching | None) -> None:
+        self.outcome, self.matched, self.matching = outcome, matched, matching
+        self.pixels, self.lpips, self.depth = FramePixels(outcome.calibration), open_lpips(), DepthErrorSum()
         self.views: list[MeasuredView] = []
-        self.lpips = open_lpips()
-        self.depth = DepthErrorSum()
         self.depth_frames: list[int] = []
-        self.matching = matching
-        self.confusion: Counts = np.zeros((len(true_names), len(names) + 1), np.int64)
+        true_classes, classes = len(matched.sequence.class_names), len(outcome.classes.names)
+        self.confusion: Counts = np.zeros((true_classes, classes + 1), np.int64)
+
+    def add(self, frame_id: int, kind: str, cam_from_world: NDArray[np.float64]) -> None:
+        """Measure a frame; nothing of one that is all masked, which shows nothing to compare."""
+        outcome, row = self.outcome, self.outcome.frame_row(frame_id)
+        frame = outcome.frames[row]
+        left_out = outcome.run.left_out(frame)
+        if left_out is not None and left_out.all():
+            return
+        view = render_outcome(outcome, cam_from_world)
+        picture, photo = view.exposed(outcome.exposure, frame.timestamp), outcome.run.image(frame)
+        if left_out is not None:  # what is no part of the scene is not judged
+            photo = np.where(left_out[..., None], picture, photo)
+        perceived = float("nan") if isinstance(self.lpips, str) else self.lpips(picture, photo)
+        likeness = psnr(picture, photo, None if left_out is None else ~left_out)
+        found = MeasuredView(frame_id, kind, likeness, ssim(picture, photo), perceived, float("nan"))
+        if (index := int(self.matched.image[row])) >= 0 and not found.is_new_pose:
+            if (depth := self.matched.sequence.depth(index)) is not None:
+                self.depth.add(view.depth, self.pixels.sample(depth))
+                self.depth_frames.append(frame_id)
+            if (labels := self.matched.sequence.labels(index)) is not None:
+                found = replace(found, label_accuracy=self._add_labels(view.labels, self.pixels.sample(labels)))
+        self.views.append(found)
+
+    def _add_labels(self, labels: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
+        counts = count_labels(labels, truth, self.confusion.shape[1] - 1, len(self.confusion))
+        self.confusion += counts
+        joined = None if self.matching is None else self.matching.joined(counts)
+        if joined is None or joined.sum() == 0:
+            return float("nan")
+        return float(np.trace(joined[:, :-1]) / joined.sum())
 
     def images(self) -> dict[str, Any]:
         """Mean PSNR, SSIM and LPIPS by kind of view."""
         cells: dict[str, Any] = {}
+        missing = {"missing": self.lpips} if isinstance(self.lpips, str) else None
         for kind in dict.fromkeys(v.kind for v in self.views):
             chosen = [v for v in self.views if v.kind == kind]
             finite = [v.psnr for v in chosen if np.isfinite(v.psnr)]
             cells[kind] = {
                 "psnr": float(np.mean(finite)) if finite else None,
                 "ssim": float(np.mean([v.ssim for v in chosen])),
-                "lpips": {"missing": self.lpips}
-                if isinstance(self.lpips, str)
-                else float(np.mean([v.lpips for v in chosen])),
+                "lpips": missing or float(np.mean([v.lpips for v in chosen])),
                 "views": len(chosen),
             }
         if HELD_OUT not in cells:
             cells[HELD_OUT] = {"missing": "no frame was held out; reconstruct with --hold-out 8"}
         return cells
 
-    def cells(self, outcome: Outcome, matched: MatchedTruth) -> dict[str, Any]:
-        """The groups images, depth, labels and views of the result."""
-        depth = self.depth.result()
+    def cells(self) -> dict[str, Any]:
+        """Collect the groups images, depth, labels and views of the result."""
+        depth, is_metric = self.depth.result(), self.outcome.metric
         depth_cells: dict[str, Any] = {"missing": "no rendered view has a true depth"}
         l1_of: dict[int, float | None] = {}
         if depth is not None:
-            depth_cells = asdict(depth)
-            if not outcome.metric:
-                depth_cells["metric_l1"] = {"missing": "the run has no metric scale"}
-            l1_of = dict(zip(self.depth_frames, self.depth.l1(1.0 if outcome.metric else depth.scale), strict=True))
+            depth_cells = asdict(depth) | ({} if is_metric else {"metric_l1": {"missing": FREE_RUN}})
+            l1_of = dict(zip(self.depth_frames, self.depth.l1(1.0 if is_metric else depth.scale), strict=True))
+        names = self.matched.sequence.class_names
         return {
             "images": self.images(),
             "depth": depth_cells,
-            "labels": label_cells(self.confusion, self.matching, outcome.semantics, matched.sequence.class_names),
+            "labels": label_cells(self.confusion, self.matching, self.outcome.semantics, names),
             "views": [v.to_json() | {"depth_l1": None if v.is_new_pose else l1_of.get(v.frame_id)} for v in self.views],
         }
-
-
-def measure_views(
-    outcome: Outcome,
-    matched: MatchedTruth,
-    alignment: AbsoluteError | None,
-    matching: Matching | None,
-    progress: Progress,
-    max_views: int,
-) -> Measured:
-    """Keyframes, held-out frames and frames between at the run's own poses; held-out frames also at poses refined on
-    the map, and frames not used for the map at the true ones. Frames that are all masked show nothing to compare."""
-    measured = Measured(outcome.classes.names, matched.sequence.class_names, matching)
-    pixels = FramePixels(outcome.calibration)
-    jobs = _jobs(outcome, matched, alignment, max_views)
-    for frame_id, kind, cam_from_world in progress.track(jobs, "measuring", len(jobs)):
-        left_out = outcome.run.left_out(outcome.frames[outcome.frame_row(frame_id)])
-        if left_out is not None and left_out.all():
-            continue
-        view = render_outcome(outcome, cam_from_world)
-        measured.views.append(_measure(outcome, matched, pixels, measured, view, frame_id, kind))
-    return measured
 
 
 def _jobs(
@@ -380,41 +389,3 @@ def refined_pose(outcome: Outcome, frame_id: int, cam_from_world: NDArray[np.flo
     )
     found: NDArray[np.float64] = se3.exp(fit.x * pixel) @ cam_from_world
     return found
-
-
-def _measure(
-    outcome: Outcome,
-    matched: MatchedTruth,
-    pixels: FramePixels,
-    measured: Measured,
-    view: MapView,
-    frame_id: int,
-    kind: str,
-) -> MeasuredView:
-    row = outcome.frame_row(frame_id)
-    frame = outcome.frames[row]
-    picture, photo = view.exposed(outcome.exposure, frame.timestamp), outcome.run.image(frame)
-    left_out = outcome.run.left_out(frame)
-    if left_out is not None:  # what is no part of the scene is not judged
-        photo = np.where(left_out[..., None], picture, photo)
-    perceived = float("nan") if isinstance(measured.lpips, str) else measured.lpips(picture, photo)
-    likeness = psnr(picture, photo, None if left_out is None else ~left_out)
-    result = MeasuredView(frame_id, kind, likeness, ssim(picture, photo), perceived, float("nan"))
-    if (index := int(matched.image[row])) < 0 or result.is_new_pose:
-        return result
-    if (depth := matched.sequence.depth(index)) is not None:
-        measured.depth.add(view.depth, pixels.sample(depth))
-        measured.depth_frames.append(frame_id)
-    if (labels := matched.sequence.labels(index)) is not None:
-        result = replace(result, label_accuracy=_add_labels(measured, view, pixels.sample(labels)))
-    return result
-
-
-def _add_labels(measured: Measured, view: MapView, truth: NDArray[np.uint8]) -> float:
-    true_classes, classes = len(measured.confusion), measured.confusion.shape[1] - 1
-    counts = count_labels(view.labels, truth, classes, true_classes)
-    measured.confusion += counts
-    joined = None if measured.matching is None else measured.matching.joined(counts)
-    if joined is None or joined.sum() == 0:
-        return float("nan")
-    return float(np.trace(joined[:, :-1]) / joined.sum())

@@ -1,7 +1,7 @@
 """Facts about the capture, frame by frame, lengths measured in it, and advice for the next one, in plain words."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -64,7 +64,7 @@ def lost_stretches(outcome: Outcome) -> list[Stretch]:
         frame, time = int(t.frame_ids[row]), float(t.timestamps[row])
         previous = stretches[-1] if stretches else None
         if previous and previous.last == frame - 1 and _kind(previous.reason) == _kind(reason):
-            stretches[-1] = Stretch(previous.first, frame, previous.start, time, previous.reason)
+            stretches[-1] = replace(previous, last=frame, end=time)
         else:
             stretches.append(Stretch(frame, frame, time, time, reason))
     return stretches
@@ -78,96 +78,51 @@ def advice(
     outcome: Outcome, capture: Capture, sparse: SparseModel | None, loops: list[LoopEdge], psnr: float | None
 ) -> list[str]:
     """Sentences for whoever holds the camera; empty when there is nothing to say."""
-    found = [
-        *_about_pictures(capture),
-        *_about_motion(outcome, sparse, loops),
-        *_about_texture(capture),
-        *_about_camera(outcome),
-    ]
-    if psnr is not None and psnr < 20:
-        found.append(
-            f"The map shows its own keyframes at {psnr:.1f} dB only: moving people, mirrors and changing light are "
-            "usual causes."
-        )
-    return found
-
-
-def _about_pictures(capture: Capture) -> list[str]:
-    found = []
-    blurred = int((capture.sharpness < _BLURRED).sum())
-    if blurred > 0.05 * len(capture.sharpness):
-        found.append(
-            f"{blurred} of {len(capture.sharpness)} frames are blurred (less than a third as sharp as usual): move "
-            "more slowly, or put on more light so that the shutter is shorter."
-        )
-    swing = float(np.quantile(capture.brightness, 0.95) - np.quantile(capture.brightness, 0.05))
-    if swing > 0.35 * float(capture.brightness.mean()):
-        found.append(
-            f"The brightness changes by {swing:.0f} of 255 along the way: lock the exposure of the camera "
-            "(a long press on most phones)."
-        )
-    dark, bright = (float((capture.brightness < _DARK).mean()), float((capture.brightness > _BRIGHT).mean()))
-    if dark > 0.2:
-        found.append(f"{dark:.0%} of the frames are very dark: put on more light.")
-    if bright > 0.2:
-        found.append(f"{bright:.0%} of the frames are burnt out: lower the exposure.")
-    return found
-
-
-def _about_motion(outcome: Outcome, sparse: SparseModel | None, loops: list[LoopEdge]) -> list[str]:
-    found = []
-    t = outcome.trajectory
-    lost = int((~t.is_posed).sum())
-    if lost:
-        found.append(
-            f"{lost} of {len(t.frame_ids)} frames have no pose here. The stretches are listed below: walk there again "
-            "slowly, and look back at what is already known."
-        )
-    centers = t.centers[t.is_posed]
-    if len(centers) < 3:
-        return found
-    extent = float(np.linalg.norm(centers.max(axis=0) - centers.min(axis=0)))
-    depth = _median_depth(sparse)
-    if depth and extent < 0.2 * depth:
-        found.append(
-            f"The camera moved by {extent / depth:.0%} of the distance to the scene only: walk, do not just turn; "
-            "depth comes from seeing things from different places."
-        )
+    t, calibration = outcome.trajectory, outcome.calibration
+    frames, lost, keyframes = len(capture.sharpness), int((~t.is_posed).sum()), len(capture.points)
+    blurred, poor = int((capture.sharpness < _BLURRED).sum()), int((capture.points < 60).sum())
+    low, high = np.quantile(capture.brightness, (0.05, 0.95))
+    dark, bright = (float(x.mean()) for x in (capture.brightness < _DARK, capture.brightness > _BRIGHT))
+    depth, centers = _median_depth(sparse), t.centers[t.is_posed]
+    extent = float(np.linalg.norm(np.ptp(centers, axis=0))) if len(centers) > 2 else float("nan")
     length = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
-    if depth and not loops and length > 8 * depth:
-        found.append(
-            "The walk never came back to a place it had seen before: end where you began, then drift can be taken out."
-        )
-    return found
+    unsure = calibration.focal_sd / calibration.intrinsics.fx
+    findings = (
+        (blurred > 0.05 * frames,
+         f"{blurred} of {frames} frames are blurred (less than a third as sharp as usual): move more slowly, or put on "
+         "more light so that the shutter is shorter."),
+        (high - low > 0.35 * float(capture.brightness.mean()),
+         f"The brightness changes by {high - low:.0f} of 255 along the way: lock the exposure of the camera (a long "
+         "press on most phones)."),
+        (dark > 0.2, f"{dark:.0%} of the frames are very dark: put on more light."),
+        (bright > 0.2, f"{bright:.0%} of the frames are burnt out: lower the exposure."),
+        (lost > 0,
+         f"{lost} of {len(t.frame_ids)} frames have no pose here. The stretches are listed below: walk there again "
+         "slowly, and look back at what is already known."),
+        (extent < 0.2 * depth,
+         f"The camera moved by {extent / depth:.0%} of the distance to the scene only: walk, do not just turn; depth "
+         "comes from seeing things from different places."),
+        (not loops and length > 8 * depth and len(centers) > 2,
+         "The walk never came back to a place it had seen before: end where you began, then drift can be taken out."),
+        (poor > 0.15 * keyframes,
+         f"{poor} of {keyframes} keyframes see fewer than 60 points. Possible causes: bare walls, blur or little "
+         "overlap; keep furniture, corners or pictures in view, and move slowly."),
+        (calibration.origin != "given" and unsure > 0.01,
+         f"The focal length is uncertain by {unsure:.1%}: give it with --intrinsics if you know it, or film with more "
+         "movement to the side."),
+        (psnr is not None and psnr < 20,
+         f"The map shows its own keyframes at {psnr or 0:.1f} dB only: moving people, mirrors and changing light are "
+         "usual causes."),
+    )  # fmt: skip
+    return [text for is_so, text in findings if is_so]
 
 
-def _median_depth(sparse: SparseModel | None) -> float | None:
-    """Usual distance from a camera to the points it sees."""
+def _median_depth(sparse: SparseModel | None) -> float:
+    """Usual distance from a camera to the points it sees; NaN, which is no more than anything, where it sees none."""
     if sparse is None or len(sparse.obs_frame) == 0:
-        return None
+        return float("nan")
     away = sparse.points_in_world[sparse.obs_point] - sparse.centers[sparse.obs_frame]
     return float(np.median(np.linalg.norm(away, axis=1)))
-
-
-def _about_texture(capture: Capture) -> list[str]:
-    found = []
-    if len(capture.points) and (poor := int((capture.points < 60).sum())) > 0.15 * len(capture.points):
-        found.append(
-            f"{poor} of {len(capture.points)} keyframes see fewer than 60 points. Possible causes: bare walls, blur or "
-            "little overlap; keep furniture, corners or pictures in view, and move slowly."
-        )
-    return found
-
-
-def _about_camera(outcome: Outcome) -> list[str]:
-    found = []
-    c = outcome.calibration
-    if c.origin != "given" and c.focal_sd > 0.01 * c.intrinsics.fx:
-        found.append(
-            f"The focal length is uncertain by {c.focal_sd / c.intrinsics.fx:.1%}: give it with --intrinsics if you "
-            "know it, or film with more movement to the side."
-        )
-    return found
 
 
 def found_lengths(outcome: Outcome) -> list[tuple[str, str]]:
@@ -180,9 +135,9 @@ def found_lengths(outcome: Outcome) -> list[tuple[str, str]]:
     if world.has_floor:
         rows.append(("camera height above the floor", measured_camera_height(shown)))
     if world.axes == "up" and shown.gaussian_map is not None:
-        rows += list(zip(("length", "width", "height"), extents(shown), strict=False))
-    texts = [(what, length_text(*found, shown.metric, shown.metres)) for what, found in rows if found is not None]
-    return [(what if what not in ("length", "width", "height") else f"map extent, {what}", t) for what, t in texts]
+        names = (f"map extent, {side}" for side in ("length", "width", "height"))
+        rows += list(zip(names, extents(shown), strict=False))
+    return [(what, length_text(*found, shown.metric, shown.metres)) for what, found in rows if found is not None]
 
 
 def path_length(outcome: Outcome) -> tuple[float, float] | None:

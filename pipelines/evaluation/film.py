@@ -26,7 +26,7 @@ from ..source.recording import is_of_source
 from ..system.progress import Progress, SilentProgress, log
 from ..system.wording import quoted
 from ..types import Array, Intrinsics
-from .views import Picture, depth_picture, depth_range, label_picture, render_outcome
+from .views import Picture, common_depth_range, depth_picture, label_picture, render_outcome
 
 _ALL_ROUND, _LEAST_ARC = np.radians(270), np.radians(20)
 """An arc of cameras from which an orbit goes all the way: what the rest would see, others saw from beside it; and the
@@ -68,21 +68,20 @@ def render_run(
     """
     if kind not in KINDS:
         raise InputError(f"kind is one of {', '.join(KINDS)}; got {kind!r}")
-    rate = 30.0 if fps is None else fps
     if is_of_source(target, run):
         raise InputError(f"{target} is the source of {run.root}: name another file or folder")
-    place = _target(target, rate, overwrite)
-    given = _given_path(path, fps)
-    flight = None if given is None else _in_world_of_run(given, run)
+    place = _target(target, 30.0 if fps is None else fps, overwrite)
+    given = None if path in PATHS else _given_path(Path(path), fps)
+    rate = given.fps if given else 30.0 if fps is None else fps
+    flight = given and given.in_world_of_run(run)
     outcome = load_outcome(run)
     outcome.require_map()
     outcome = outcome if size is None else _of_size(outcome, size)
-    near, far = _depth_range(outcome)
+    near, far = common_depth_range(outcome)
     if flight is None:
         views = [(outcome, pose) for pose in _path(outcome, str(path), rate, (near * far) ** 0.5)]
     else:
         views = [(_with_fov(outcome, fov), pose) for pose, fov in zip(*flight, strict=True)]
-    rate = rate if given is None else given.fps
     tell(f"rendering {len(views)} images: a film of {len(views) / rate:.0f} s at {rate:g} images a second")
     steps = (progress or SilentProgress()).track(views, "rendering", len(views))
     return _write(place, target, (_draw(seen, pose, kind, near, far) for seen, pose in steps), rate)
@@ -162,14 +161,6 @@ def film_seconds(times: Array) -> float:
     gaps = np.diff(times)
     seconds = float(np.minimum(gaps, _MAX_GAP).sum())
     return min(seconds, _MAX_OF_PHOTOS) if np.median(gaps) >= _MAX_GAP else seconds
-
-
-def _depth_range(outcome: Outcome) -> tuple[float, float]:
-    """One range of colours for the whole video, from a few of the run's views."""
-    poses = outcome.trajectory.cam_from_world[outcome.trajectory.is_posed]
-    chosen = poses[np.linspace(0, len(poses) - 1, min(5, len(poses))).astype(int)]
-    ranges = np.array([depth_range(render_outcome(outcome, pose).depth) for pose in chosen])
-    return float(ranges[:, 0].min()), float(ranges[:, 1].max())
 
 
 def _draw(outcome: Outcome, world_from_cam: Array, kind: str, near: float, far: float) -> Picture:
@@ -279,36 +270,32 @@ class CameraPath:
         poses = _poses(rotations.as_matrix(), CubicHermiteSpline(known, centers, np.gradient(centers, axis=0))(at))
         return poses, np.interp(at, known, self.fovs)
 
+    def in_world_of_run(self, run: RunFolder) -> tuple[Array, Array]:
+        """Return the flight in the run's own world. Raises InputError for a run without the exported world."""
+        poses, fovs = self.flight()
+        if self.world == RUN:
+            return poses, fovs
+        if (world := run.find(WORLD)) is None:
+            raise InputError(
+                f"the camera path is in the coordinates of exported files, and {run.root} has none: "
+                f"run `msgs-slam resume {quoted(run.root)}` first"
+            )
+        cam_from_run = world.exported_from_run.inverse().apply_to_poses(np.linalg.inv(poses))
+        return np.asarray(np.linalg.inv(cam_from_run), np.float64), fovs
+
     @property
     def image_count(self) -> int:
         """The number of images of the flight, both ends included."""
         return max(2, round((len(self.fovs) - 1) * self.seconds_per_keyframe * self.fps) + 1)
 
 
-def _given_path(path: str | Path, fps: float | None) -> CameraPath | None:
-    """The camera path in a file; None for a name of `PATHS`."""
-    if path in PATHS:
-        return None
-    if not Path(path).is_file():
+def _given_path(path: Path, fps: float | None) -> CameraPath:
+    if not path.is_file():
         raise InputError(
             f"path is one of {', '.join(PATHS)}, or a camera path that `msgs-slam view` has saved; there is no file "
             f"{str(path)!r}"
         )
-    return read_camera_path(Path(path), fps)
-
-
-def _in_world_of_run(path: CameraPath, run: RunFolder) -> tuple[Array, Array]:
-    """The flight in the run's own world: (N, 4, 4) world_from_cam, (N,) fields of view in degrees."""
-    poses, fovs = path.flight()
-    if path.world == RUN:
-        return poses, fovs
-    if (world := run.find(WORLD)) is None:
-        raise InputError(
-            f"the camera path is in the coordinates of exported files, and {run.root} has none: "
-            f"run `msgs-slam resume {quoted(run.root)}` first"
-        )
-    cam_from_run = world.exported_from_run.inverse().apply_to_poses(np.linalg.inv(poses))
-    return np.asarray(np.linalg.inv(cam_from_run), np.float64), fovs
+    return read_camera_path(path, fps)
 
 
 def read_camera_path(path: Path, fps: float | None = None) -> CameraPath:
@@ -343,18 +330,15 @@ def _keyframe(path: Path, index: int, row: Any) -> tuple[Array, float]:
     where = f"{path}: keyframe {index}"
     if not isinstance(row, dict):
         raise InputError(f"{where} is {str(row)[:40]!r}, expected an object in braces: {_AGAIN}")
-    position, wxyz = (_vector(where, row, name, n) for name, n in (("position", 3), ("rotation_wxyz", 4)))
+    for name, length in (("position", 3), ("rotation_wxyz", 4)):
+        value = row.get(name)
+        if not isinstance(value, list) or [type(v) in (int, float) for v in value] != [True] * length:
+            raise InputError(f"{where}: {name} is {str(value)[:60]!r}, expected {length} numbers: {_AGAIN}")
+    wxyz, position = np.array(row["rotation_wxyz"], np.float64), np.array(row["position"], np.float64)
     if not 0.9 < np.linalg.norm(wxyz) < 1.1:
         raise InputError(f"{where}: rotation_wxyz is no unit quaternion (w, x, y, z): {_AGAIN}")
     pose = _poses(Rotation.from_quat(wxyz[None, [1, 2, 3, 0]]).as_matrix(), position[None])[0]
     return pose, _limited(row, Path(where), "fov_degrees")
-
-
-def _vector(where: str, row: dict[str, Any], name: str, length: int) -> Array:
-    value = row.get(name)
-    if not isinstance(value, list) or len(value) != length or not all(type(v) in (int, float) for v in value):
-        raise InputError(f"{where}: {name} is {str(value)[:60]!r}, expected {length} numbers: {_AGAIN}")
-    return np.array(value, np.float64)
 
 
 def _limited(table: dict[str, Any], path: Path, name: str) -> float:

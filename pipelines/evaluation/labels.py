@@ -104,17 +104,6 @@ def matched_by_majority(confusion: Counts) -> NDArray[np.int64]:
     return match
 
 
-def renamed(confusion: Counts, match: NDArray[np.int64]) -> Counts:
-    """The square confusion after label k is called true class match[k]; -1 becomes unlabelled."""
-    true_classes = len(confusion)
-    require_shape("match", match, (confusion.shape[1] - 1,))
-    square = np.zeros((true_classes, true_classes + 1), np.int64)
-    square[:, -1] = confusion[:, -1]
-    for label, true_class in enumerate(match):
-        square[:, true_class if true_class >= 0 else true_classes] += confusion[:, label]
-    return square
-
-
 @dataclass(frozen=True)
 class Matching:
     """The classes a run and the truth have in common. names: K common classes; of_ours (C,) and of_truth (T,): the
@@ -273,24 +262,21 @@ def label_cells(
     if matching is not None:
         of = {"input": given, "matching": matching.how}
         return {**of, **_score_cells(score(matching.joined(confusion)), matching.names)}
+    every = np.arange(len(true_names))
+    kinds = {"one to one": matched_one_to_one(confusion), "majority": matched_by_majority(confusion)}
+    found = {name: score(Matching(true_names, match, every, name).joined(confusion)) for name, match in kinds.items()}
     return {
         "input": given,
         "matching": "none",
         "missing": "the run's classes have other names than the truth's",
-        "clustering": {
-            "one to one": _score_cells(score(renamed(confusion, matched_one_to_one(confusion))), true_names),
-            "majority": _score_cells(score(renamed(confusion, matched_by_majority(confusion))), true_names),
-        },
+        "clustering": {name: _score_cells(of_kind, true_names) for name, of_kind in found.items()},
     }
 
 
 def _score_cells(found: LabelScore | None, names: tuple[str, ...]) -> dict[str, Any]:
     if found is None:
         return {"missing": "no pixel has a true class"}
-    return {
-        "mean_iou": found.mean_iou,
-        "pixel_accuracy": found.pixel_accuracy,
-        "unlabelled": found.unlabelled,
-        "class_iou": {n: float(v) for n, v in zip(names, found.class_iou, strict=True) if np.isfinite(v)},
-        "class_recall": {n: float(v) for n, v in zip(names, found.class_recall, strict=True) if np.isfinite(v)},
+    of_class = {"class_iou": found.class_iou, "class_recall": found.class_recall}
+    return {"mean_iou": found.mean_iou, "pixel_accuracy": found.pixel_accuracy, "unlabelled": found.unlabelled} | {
+        key: {n: float(v) for n, v in zip(names, of, strict=True) if np.isfinite(v)} for key, of in of_class.items()
     }

@@ -15,18 +15,18 @@ from scipy.spatial import cKDTree
 from ...formats.errors import InputError, install_extra
 from ...formats.reading import file_sha256
 from ..compute.ssim import TAPS, similarity
-from ..geometry import se3
-from ..geometry.camera import project, unproject_depth
+from ..geometry.posed_depth import PosedDepth
+from ..geometry.voxels import voxel_keys
 from ..networks.registry import Model, ModelStore
 from ..networks.runtime import open_runtime
-from ..outcome import Outcome
+from ..outcome import Outcome, spread_sample
 from ..run.files import MESH
 from ..scene.world import FIRST, WORLD
 from ..types import Intrinsics, require_shape
 from .truth import AbsoluteError, MatchedTruth
 
 Image = NDArray[np.uint8]
-Distance = Callable[[NDArray[np.float32], NDArray[np.float32]], float]
+Measure = Callable[[Image, Image], float]
 _INPUTS = ("image0", "image1")
 
 SAMPLES = 200_000
@@ -67,27 +67,15 @@ def ssim(image: NDArray, truth: NDArray) -> float:
     return float(similarity(a, b)[0][edge:-edge, edge:-edge].mean())
 
 
-class Lpips:
-    """Learned perceptual distance on AlexNet's features (Zhang et al., CVPR 2018, version 0.1); 0 = equal."""
-
-    def __init__(self, distance: Distance) -> None:
-        """`distance` compares two (1, 3, H, W) images in -1..1."""
-        self._distance = distance
-
-    def __call__(self, image: Image, truth: Image) -> float:
-        """Of two (H, W, 3) images in 0..255. Raises ValueError for different shapes."""
-        require_shape("image", image, truth.shape)
-        return self._distance(_scaled(image), _scaled(truth))
-
-
-def open_lpips() -> Lpips | str:
-    """The measure, or why there is none: the file, or the package with its weights, is not here. Downloads nothing."""
+def open_lpips() -> Measure | str:
+    """Open the learned perceptual distance on AlexNet's features (Zhang et al., CVPR 2018, version 0.1) of two images
+    (H, W, 3) in 0..255, 0 = equal; or say why there is none: neither file nor package is here. Downloads nothing."""
     store = ModelStore.open()
     model = store.first_here("perceptual")
     return _by_package() if model is None else _by_file(store, model)
 
 
-def _by_file(store: ModelStore, model: Model) -> Lpips | str:
+def _by_file(store: ModelStore, model: Model) -> Measure | str:
     """Raises InputError for a file of the right hash that onnxruntime cannot run."""
     path = store.path(model)
     if file_sha256(path) != model.sha256:
@@ -96,14 +84,14 @@ def _by_file(store: ModelStore, model: Model) -> Lpips | str:
     if tuple(runtime.inputs) != _INPUTS or len(runtime.outputs) != 1:
         raise InputError(f"{path}: its inputs are {', '.join(runtime.inputs)}; another kind of file is needed")
 
-    def distance(image: NDArray[np.float32], truth: NDArray[np.float32]) -> float:
-        found = runtime.run(list(runtime.outputs), dict(zip(_INPUTS, (image, truth), strict=True)))
+    def distance(image: Image, truth: Image) -> float:
+        found = runtime.run(list(runtime.outputs), dict(zip(_INPUTS, _scaled(image, truth), strict=True)))
         return float(found[0].item())
 
-    return Lpips(distance)
+    return distance
 
 
-def _by_package() -> Lpips | str:
+def _by_package() -> Measure | str:
     try:
         import lpips
         from torchvision.models import AlexNet_Weights
@@ -118,15 +106,16 @@ def _by_package() -> Lpips | str:
     model = lpips.LPIPS(net="alex", verbose=False).eval()
 
     @torch.no_grad()
-    def distance(image: NDArray[np.float32], truth: NDArray[np.float32]) -> float:
-        return float(model(torch.from_numpy(image), torch.from_numpy(truth)).item())
+    def distance(image: Image, truth: Image) -> float:
+        return float(model(*map(torch.from_numpy, _scaled(image, truth))).item())
 
-    return Lpips(distance)
+    return distance
 
 
-def _scaled(image: Image) -> NDArray[np.float32]:
-    """(1, 3, H, W) in -1..1, as the network was trained."""
-    return np.ascontiguousarray((image.astype(np.float32) / 127.5 - 1).transpose(2, 0, 1)[None])
+def _scaled(image: Image, truth: Image) -> list[NDArray[np.float32]]:
+    """(1, 3, H, W) of both in -1..1, as the network was trained. Raises ValueError for different shapes."""
+    require_shape("image", image, truth.shape)
+    return [np.ascontiguousarray((x.astype(np.float32) / 127.5 - 1).transpose(2, 0, 1)[None]) for x in (image, truth)]
 
 
 @dataclass(frozen=True)
@@ -196,23 +185,6 @@ class SurfaceError:
     threshold: float
 
 
-def sample_surface(vertices: NDArray, faces: NDArray, count: int, seed: int = 0) -> Points:
-    """(count, 3) points spread evenly by area over a triangle mesh. Raises ValueError for a mesh without area."""
-    corners = vertices[faces].astype(np.float64)
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    if not areas.sum() > 0:
-        raise ValueError("the mesh has no area")
-    rng = np.random.default_rng(seed)
-    # Stratified: one draw in each of `count` equal shares of the area.
-    at = (np.arange(count) + rng.random(count)) / count * areas.sum()
-    chosen = np.clip(np.searchsorted(np.cumsum(areas), at), 0, len(areas) - 1)
-    a, b = rng.random((2, count))
-    over = a + b > 1
-    a, b = np.where(over, 1 - a, a), np.where(over, 1 - b, b)
-    first, second, third = corners[chosen].transpose(1, 0, 2)
-    return first + a[:, None] * (second - first) + b[:, None] * (third - first)
-
-
 def surface_error(points: Points, true_points: Points, threshold: float = 0.05) -> SurfaceError:
     """Errors between two sampled surfaces (N, 3) and (M, 3) in metres. Raises ValueError where one is empty."""
     if len(points) == 0 or len(true_points) == 0:
@@ -226,31 +198,7 @@ def surface_error(points: Points, true_points: Points, threshold: float = 0.05) 
 
 def thinned(points: Points, cell: float) -> Points:
     """One point of every cell of a grid of `cell` metres: the first in the order of the cells."""
-    if len(points) == 0:
-        return points
-    cells = np.floor(points / cell).astype(np.int64)
-    cells -= cells.min(axis=0)
-    # One number a cell sorts twenty times faster than three.
-    number = np.ravel_multi_index(tuple(cells.T), tuple((cells.max(axis=0) + 1).tolist()))
-    return points[np.unique(number, return_index=True)[1]]
-
-
-def depth_points(depth: NDArray, camera: Intrinsics, world_from_cam: NDArray[np.float64], stride: int = 1) -> Points:
-    """(P, 3) world points of every `stride`-th pixel with a depth."""
-    points = unproject_depth(depth, camera)[::stride, ::stride]
-    return se3.transform(world_from_cam, points[depth[::stride, ::stride] > 0])
-
-
-def seen_in_depth(
-    points: Points, depth: NDArray, camera: Intrinsics, cam_from_world: NDArray[np.float64], slack: float
-) -> NDArray[np.bool_]:
-    """(N,) whether a point lies in the image and no further than `slack` metres behind the depth seen there."""
-    xy, z = project(se3.transform(cam_from_world, points), camera)
-    # Pixels of points behind the camera are NaN, which compares false.
-    seen = np.asarray(((xy >= 0) & (xy < (camera.width, camera.height))).all(axis=1))
-    column, row = xy[seen].astype(np.int64).T
-    seen[seen] = (depth[row, column] > 0) & (z[seen] < depth[row, column] + slack)
-    return seen
+    return points[np.unique(voxel_keys(points, cell), return_index=True)[1]]
 
 
 def mesh_cells(outcome: Outcome, matched: MatchedTruth, alignment: AbsoluteError | None) -> dict[str, Any]:
@@ -268,42 +216,37 @@ def mesh_cells(outcome: Outcome, matched: MatchedTruth, alignment: AbsoluteError
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or not mesh.area > 0:
         return {"missing": "the mesh is empty"}
     world = outcome.run.find(WORLD) or FIRST
-    points = sample_surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), SAMPLES)
+    points = np.asarray(trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)[0])
     points = alignment.alignment.apply(world.exported_from_run.inverse().apply(points))
-    points = points[_seen_by_any(points, views)]
+    points = points[np.any([sees(view, points) for view in views], axis=0)]
     if len(points) == 0:
         return {"missing": "no camera with true depth sees the mesh"}
     return {**asdict(surface_error(points, truth)), "points": len(points), "true points": len(truth)}
 
 
-_SeenView = tuple[NDArray[np.float32], Intrinsics, NDArray[np.float64]]
+def sees(view: PosedDepth, points: Points) -> NDArray[np.bool_]:
+    """(N,) whether a point lies in the image and no further than `SLACK` behind the depth seen there."""
+    xy, z, seen = view.seen(points)
+    column, row = xy[seen].astype(np.int64).T
+    seen[seen] = (view.depth[row, column] > 0) & (z[seen] < view.depth[row, column] + SLACK)
+    return seen
 
 
-def true_surface(matched: MatchedTruth) -> tuple[NDArray[np.float64], list[_SeenView]]:
-    """Points of the true depth of up to `VIEWS` frames, thinned; and (depth, camera, cam_from_world) of each.
+def true_surface(matched: MatchedTruth) -> tuple[NDArray[np.float64], list[PosedDepth]]:
+    """Points of the true depth of up to `VIEWS` frames, thinned; and these depths.
 
     A lens with distortion is left out: its depth does not follow the pinhole that the points are made with.
     """
     sequence = matched.sequence
     if sequence.camera is None or sequence.camera.is_distorted or not sequence.has_depth:
         return np.zeros((0, 3)), []
-    rows = np.flatnonzero(matched.has_pose & (matched.image >= 0))
     points, views = [], []
-    for row in rows[np.unique(np.linspace(0, len(rows) - 1, VIEWS).astype(int))] if len(rows) else ():
-        depth = sequence.depth(int(matched.image[row]))
-        if depth is None:
+    for row in spread_sample(np.flatnonzero(matched.has_pose & (matched.image >= 0)).tolist(), VIEWS):
+        if (depth := sequence.depth(int(matched.image[row]))) is None:
             continue
         k = sequence.camera.resized(depth.shape[1], depth.shape[0])
         camera = Intrinsics(k.width, k.height, k.fx, k.fy, k.cx, k.cy)
-        pose = matched.world_from_cam[row]
-        points.append(depth_points(depth, camera, pose, stride=max(1, max(depth.shape) // 320)))
-        views.append((depth, camera, np.linalg.inv(pose)))
+        views.append(PosedDepth(camera, np.linalg.inv(matched.world_from_cam[row]), depth, np.ones_like(depth)))
+        xy, z, _ = views[-1].grid(320)
+        points.append(views[-1].in_world(xy, z))
     return (thinned(np.concatenate(points), CELL) if points else np.zeros((0, 3))), views
-
-
-def _seen_by_any(points: NDArray[np.float64], views: list[_SeenView]) -> NDArray[np.bool_]:
-    seen = np.zeros(len(points), dtype=bool)
-    for depth, camera, cam_from_world in views:
-        left = np.flatnonzero(~seen)
-        seen[left] = seen_in_depth(points[left], depth, camera, cam_from_world, SLACK)
-    return seen

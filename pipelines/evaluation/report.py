@@ -1,5 +1,6 @@
 """One HTML file about a run that opens anywhere, without a network."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
@@ -14,7 +15,7 @@ from ...formats.mesh import read_textured_glb
 from ...formats.reading import read_bytes
 from ...formats.textfile import read_json, read_text
 from ..config import Config, config_to_dict
-from ..export.kinds import IMAGES, WEB_PAGE
+from ..export.kinds import IMAGES, README, WEB_PAGE
 from ..export.readme import lengths
 from ..geometry.sparse_model import SparseModel
 from ..outcome import Outcome, load_outcome, spread_sample
@@ -45,7 +46,7 @@ from .html import (
     table,
 )
 from .metrics import psnr
-from .views import depth_picture, depth_range, labels_on_photo, mesh_picture, render_outcome
+from .views import Picture, common_depth_range, depth_picture, labels_on_photo, mesh_picture, render_outcome
 from .write import (
     JUDGED,
     PATH_FROM_ABOVE,
@@ -90,8 +91,7 @@ def _report(outcome: Outcome, target: Path, progress: Progress) -> str:
     evaluation = read_json(run.evaluation_file) if run.evaluation_file.exists() else None
     body = "".join(
         [
-            _heading(outcome),
-            _page_link(run, target),
+            _heading(outcome, target),
             "" if views is None else section("What the map shows", views.sheet, class_legend(outcome, views)),
             _mesh_section(outcome),
             _advice_section(outcome, capture, sparse, loops),
@@ -123,7 +123,7 @@ def _figures(outcome: Outcome) -> list[tuple[str, str]]:
     return pairs
 
 
-def _heading(outcome: Outcome) -> str:
+def _heading(outcome: Outcome, target: Path) -> str:
     pairs = _figures(outcome)
     if pieces := outcome.pieces():
         apart = sum(int(p.trajectory.is_posed.sum()) for p in pieces)
@@ -131,14 +131,10 @@ def _heading(outcome: Outcome) -> str:
     pairs.append(("seconds", f"{sum(r.seconds for r in outcome.records.values()):.0f}"))
     source = escape(str(load_source(outcome.run).path))
     after = _AFTER.get(outcome.map_stage or outcome.pose_stage, "")
-    return f'<h1>{escape(outcome.run.place.name)}</h1><p class="sub">Source: {source}{after}</p>{chips(pairs)}'
-
-
-def _page_link(run: RunFolder, report: Path) -> str:
-    """The map's page, where the report lies beside the export."""
-    if report.resolve().parent != run.root.resolve() or not run.has("export", WEB_PAGE):
-        return ""
-    return f'<p><a href="export/{WEB_PAGE}">The map in one page</a>, to look at and to send.</p>'
+    head, run = f'<h1>{escape(outcome.run.place.name)}</h1><p class="sub">Source: {source}{after}</p>', outcome.run
+    is_beside = target.resolve().parent == run.root.resolve() and run.has("export", WEB_PAGE)
+    link = f'<p><a href="export/{WEB_PAGE}">The map in one page</a>, to look at and to send.</p>' if is_beside else ""
+    return head + chips(pairs) + link
 
 
 _AFTER = {
@@ -165,11 +161,15 @@ def _mesh_section(outcome: Outcome) -> str:
         return ""
     t, camera = outcome.moved(world.exported_from_run).trajectory, outcome.calibration.intrinsics.at_most(_TILE_WIDTH)
     mesh = replace(mesh, vertices=(mesh.vertices @ world.gltf_from_exported).astype(np.float32))
-    tiles = []
-    for row in spread_sample(np.flatnonzero(t.is_keyframe).tolist(), 4):
-        caption = f"mesh, {t.timestamps[row]:.2f} s"
-        tiles.append(f"<div>{image(mesh_picture(mesh, t.cam_from_world[row], camera), caption)}{caption}</div>")
-    return section("The mesh", f'<div class="grid">{"".join(tiles)}</div>')
+    rows = spread_sample(np.flatnonzero(t.is_keyframe).tolist(), 4)
+    shown = ((mesh_picture(mesh, t.cam_from_world[row], camera), f"mesh, {t.timestamps[row]:.2f} s") for row in rows)
+    return section("The mesh", _tiles(shown))
+
+
+def _tiles(pictures: Iterable[tuple[Picture, str]]) -> str:
+    """Pictures in a grid, each above its caption."""
+    tiles = (f"<div>{image(at_most_wide(p, _TILE_WIDTH), text)}{escape(text)}</div>" for p, text in pictures)
+    return f'<div class="grid">{"".join(tiles)}</div>'
 
 
 def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[LoopEdge]) -> str:
@@ -209,8 +209,7 @@ def _still_picture(outcome: Outcome) -> str:
     photo, left_out = outcome.run.image(frame).copy(), outcome.run.left_out(frame)
     if left_out is not None:
         photo[left_out] = photo[left_out] // 2 + np.array([127, 0, 0], np.uint8)
-    caption = f"left out, {frame.timestamp:.2f} s"
-    return f'<div class="grid"><div>{image(at_most_wide(photo, _TILE_WIDTH), caption)}{caption}</div></div>'
+    return _tiles([(photo, f"left out, {frame.timestamp:.2f} s")])
 
 
 def _scale_text(outcome: Outcome) -> str:
@@ -270,35 +269,23 @@ def truth_section(evaluation: dict[str, Any], outcome: Outcome) -> str:
 
 
 def _time_section(outcome: Outcome) -> str:
-    rows = [
-        (
-            name,
-            f"{r.seconds:.1f}",
-            f"{r.peak_memory_mb:.0f}",
-            ", ".join(f"{key} {figure_text(value, key)}" for key, value in r.figures.items()),
-        )
-        for name, r in outcome.records.items()
-    ]
+    rows = []
+    for name, r in outcome.records.items():
+        figures = ", ".join(f"{key} {figure_text(value, key)}" for key, value in r.figures.items())
+        rows.append((name, f"{r.seconds:.1f}", f"{r.peak_memory_mb:.0f}", figures))
     return section("Stages", table(("stage", "seconds", "peak MB", "figures"), rows))
 
 
 def _export_section(outcome: Outcome) -> str:
     if "export" not in outcome.records:
         return section("Files for other programs", "<p>Not exported yet.</p>")
-    files = [row for row in files_of_export(outcome.run) if Path(row[0]).parts[0] not in (IMAGES, "masks")]
-    written = outcome.run.path("export", "README.txt")
+    run, root = outcome.run, outcome.run.stage("export")
+    written = root / README
     notes = f"<pre>{escape(read_text(written))}</pre>" if written.is_file() else ""
-    return section("Files for other programs", notes, table(("in export/", "size"), files))
-
-
-def files_of_export(run: RunFolder) -> list[tuple[str, str]]:
-    """Name and size of the files of the stage, or that one is not as the stage left it, and of those that
-    `msgs-slam export --only` has added since. Reads all of them."""
-    root = run.stage("export")
-    wrong = {name: f"missing or damaged: msgs-slam resume {quoted(run.root)}" for name in run.damaged("export")}
     sizes = {p.relative_to(root).as_posix(): _size(p.stat().st_size) for p in root.rglob("*") if p.is_file()}
-    sizes.pop(LIST, None)
-    return sorted((sizes | wrong).items())
+    sizes |= {name: f"missing or damaged: msgs-slam resume {quoted(run.root)}" for name in run.damaged("export")}
+    files = [row for row in sorted(sizes.items()) if row[0].partition("/")[0] not in (IMAGES, "masks", LIST)]
+    return section("Files for other programs", notes, table(("in export/", "size"), files))
 
 
 def _size(count: int) -> str:
@@ -336,8 +323,8 @@ def render_views(outcome: Outcome, progress: Progress) -> RenderedViews:
     keyframes = spread_sample(t.frame_ids[t.is_keyframe].tolist(), MEASURED_VIEWS)
     shown = set(spread_sample(keyframes, SHOWN_VIEWS))
     values: list[float] = []
-    tiles: list[str] = []
-    reach = _reach(outcome, sorted(shown))
+    pictures: list[tuple[Picture, str]] = []
+    reach = common_depth_range(outcome)
     counts = np.zeros(256, np.int64)
     for frame_id in progress.track(keyframes, "rendering", len(keyframes)):
         row = outcome.frame_row(frame_id)
@@ -350,13 +337,10 @@ def render_views(outcome: Outcome, progress: Progress) -> RenderedViews:
             depth = depth_picture(view.depth, *reach)
             labels = labels_on_photo(photo, view.labels, outcome.classes.colors)
             pairs = ((photo, "image"), (picture, "map"), (depth, "depth"), (labels, "classes"))
-            for drawn, what in pairs:
-                caption = f"{what}, {frame.timestamp:.2f} s"
-                tiles.append(f"<div>{image(at_most_wide(drawn, _TILE_WIDTH), caption)}{escape(caption)}</div>")
-    first, rest = "".join(tiles[: 4 * _ROWS]), "".join(tiles[4 * _ROWS :])
-    more = f'<details><summary>More views</summary><div class="grid">{rest}</div></details>' if rest else ""
-    scale = _depth_scale(*reach, unit_name(outcome))
-    return RenderedViews(keyframes, values, counts, f'<div class="grid">{first}</div>{more}{scale}')
+            pictures += [(drawn, f"{what}, {frame.timestamp:.2f} s") for drawn, what in pairs]
+    first, rest = pictures[: 4 * _ROWS], pictures[4 * _ROWS :]
+    more = f"<details><summary>More views</summary>{_tiles(rest)}</details>" if rest else ""
+    return RenderedViews(keyframes, values, counts, _tiles(first) + more + _depth_scale(*reach, unit_name(outcome)))
 
 
 def _depth_scale(nearest: float, farthest: float, unit: str) -> str:
@@ -369,32 +353,20 @@ def _depth_scale(nearest: float, farthest: float, unit: str) -> str:
     return f'<div class="legend scale">depth, {escape(unit)}: {low} {bar} {high} {middle}</div>'
 
 
-def _reach(outcome: Outcome, ids: list[int]) -> tuple[float, float]:
-    """Nearest and farthest of most pixels of a few of the views: one range for all, so that colours compare."""
-    rows = [outcome.frame_row(frame_id) for frame_id in ids[:: max(1, len(ids) // 3)]]
-    ranges = [depth_range(render_outcome(outcome, outcome.trajectory.cam_from_world[row]).depth) for row in rows]
-    return (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else (1.0, 2.0)
-
-
 def quality_section(outcome: Outcome, capture: Capture, views: RenderedViews | None) -> str:
     """Plots over the frames."""
-    ids = np.array([f.id for f in outcome.frames], np.float64)
-    series: list[tuple[str, str, NDArray, NDArray, str]] = []
-    if views is not None:
-        series.append(("PSNR of keyframes", "dB", np.array(views.ids), np.array(views.psnr), BLUE))
-    series.append(("Sharpness relative to the median", "", ids, capture.sharpness, ORANGE))
-    series.append(("Mean brightness", "0..255", ids, capture.brightness, GREY))
-    return section(
-        "Quality over time",
-        '<div class="two">',
-        *(_over_frames(name, unit, x, y, color) for name, unit, x, y, color in series if len(x)),
-        "</div>",
+    ids = np.array([f.id for f in outcome.frames])
+    series: list[tuple[str, str, NDArray, NDArray, str]] = [
+        ("Sharpness relative to the median", "", ids, capture.sharpness, ORANGE),
+        ("Mean brightness", "0..255", ids, capture.brightness, GREY),
+    ]
+    if views is not None and views.ids:
+        series.insert(0, ("PSNR of keyframes", "dB", np.array(views.ids), np.array(views.psnr), BLUE))
+    plots = (
+        plot(name, "frame", unit, [Line(np.stack([x, y], 1).astype(np.float64), color, "")], height=240)
+        for name, unit, x, y, color in series
     )
-
-
-def _over_frames(name: str, unit: str, ids: NDArray, values: NDArray, color: str) -> str:
-    points = np.stack([ids.astype(np.float64), np.asarray(values, np.float64)], axis=1)
-    return plot(name, "frame", unit, [Line(points, color, "")], height=240)
+    return section("Quality over time", '<div class="two">', *plots, "</div>")
 
 
 def class_legend(outcome: Outcome, views: RenderedViews) -> str:

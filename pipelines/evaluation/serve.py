@@ -44,6 +44,10 @@ _POINT_RADIUS, _POINT_OPACITY = 0.0024, 4.0
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; frame-src 'self'"
 )
+_HEADERS = {
+    "Cache-Control": "no-store", "X-Content-Type-Options": "nosniff", "X-Frame-Options": "SAMEORIGIN",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}  # fmt: skip
 _NOTHING = "<!doctype html><meta charset=utf-8><body style='font:15px sans-serif;color:#ddd;background:#000'>{}"
 
 
@@ -161,11 +165,6 @@ class PageServer(ThreadingHTTPServer):
             return page
 
 
-def _shell(run: RunFolder) -> str:
-    """The page around the map's, which watches the run and loads the map's again."""
-    return (PARTS / "live.html").read_text(encoding="utf-8").replace("{{title}}", escape(run.place.name))
-
-
 def _version(run: RunFolder) -> str:
     """Changes with the files of every stage whose results are shown."""
     seen = {name: record.content for name, record in load_records(run).items() if name != "proxy"}
@@ -177,12 +176,18 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         hosts = self.headers.get_all("Host", [])
-        if len(hosts) != 1 or _host_name(hosts[0]) not in _NAMES:
+        try:
+            is_here = [urlsplit(f"//{host}").hostname in _NAMES for host in hosts] == [True]
+        except ValueError:
+            is_here = False
+        if not is_here:
             return self._answer(403, "text/plain", "This server answers to 127.0.0.1 and localhost only.\n")
         name = urlsplit(self.path).path.removeprefix("/")
         try:
             if name == "":
-                return self._answer(200, "text/html", _shell(self.server.run), _POLICY)
+                frame = (PARTS / "live.html").read_text(encoding="utf-8")
+                page = frame.replace("{{title}}", escape(self.server.run.place.name))
+                return self._answer(200, "text/html", page, _POLICY)
             if name == "state":
                 return self._answer(200, "application/json", self.server.state())
             if name in self.server.parts():
@@ -194,23 +199,11 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self, status: int, kind: str, text: str, policy: str = "") -> None:
         body = text.encode()
         self.send_response(status)
-        self.send_header("Content-Type", f"{kind}; charset=utf-8")
-        self.send_header("Content-Length", str(len(body)))
-        self.send_header("Cache-Control", "no-store")
-        self.send_header("X-Content-Type-Options", "nosniff")
-        self.send_header("X-Frame-Options", "SAMEORIGIN")
-        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
-        if policy:
-            self.send_header("Content-Security-Policy", policy)
+        more = {"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(body))}
+        for name, value in {**more, **_HEADERS, **({"Content-Security-Policy": policy} if policy else {})}.items():
+            self.send_header(name, value)
         self.end_headers()
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: object) -> None:
         log.debug("%s " + format, self.address_string(), *args)
-
-
-def _host_name(header: str) -> str | None:
-    try:
-        return urlsplit(f"//{header}").hostname
-    except ValueError:
-        return None

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ...formats.datasets import Dataset
 from ...formats.errors import InputError
@@ -210,26 +211,15 @@ class AbsoluteError:
 
 
 def associate(times: Array, truth_times: Array, tolerance: float = 0.01) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices (i, j) of estimates and truths of the same instant, within `tolerance` seconds; each used at most once.
-
-    The nearest pairs are taken first. Both lists may have any order and gaps.
-    """
+    """Indices (i, j) of estimates and truths that are each other's nearest, within `tolerance` seconds; the lists may
+    have any order and gaps."""
     if len(times) == 0 or len(truth_times) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    order = np.argsort(truth_times, kind="stable")
-    after = np.clip(np.searchsorted(truth_times[order], times), 0, len(order) - 1)
-    before = np.maximum(after - 1, 0)
-    gap_before, gap_after = (np.abs(truth_times[order[k]] - times) for k in (before, after))
-    nearest = np.where(gap_before < gap_after, order[before], order[after])
-    gaps = np.minimum(gap_before, gap_after)
-    taken: set[int] = set()
-    pairs = []
-    for i in np.argsort(gaps, kind="stable"):
-        if gaps[i] <= tolerance and int(nearest[i]) not in taken:
-            taken.add(int(nearest[i]))
-            pairs.append((int(i), int(nearest[i])))
-    matched = np.array(sorted(pairs), np.int64).reshape(-1, 2)
-    return matched[:, 0], matched[:, 1]
+    times, truth_times = (np.nan_to_num(t[:, None], nan=far) for t, far in ((times, -1e18), (truth_times, 1e18)))
+    gaps, nearest = cKDTree(truth_times).query(times)
+    back = cKDTree(times).query(truth_times)[1]
+    i = np.flatnonzero((gaps <= tolerance) & (back[nearest] == np.arange(len(times))))
+    return i, nearest[i]
 
 
 def absolute_error(centers: Array, true_centers: Array, with_scale: bool) -> AbsoluteError:

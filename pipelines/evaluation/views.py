@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from ...formats.mesh import TexturedMesh
 from ..compute.raster import draw_faces
-from ..outcome import Exposure, Outcome, labels_of_channels
+from ..outcome import Exposure, Outcome, labels_of_channels, spread_sample
 from ..providers import class_colors
-from ..render.api import render
-from ..render.gaussian_map import GaussianMap, decided_channels
-from ..render.inspection import median_depth
+from ..render.gaussian_map import GaussianMap
+from ..render.inspection import render_all
 from ..types import VOID, Array, ClassTable, Intrinsics
 
 Picture = NDArray[np.uint8]
@@ -41,7 +40,6 @@ class MapView:
         return np.round(np.clip(color, 0, 1) * 255).astype(np.uint8)
 
 
-@torch.no_grad()
 def view_map(
     gaussian_map: GaussianMap,
     label_of_channel: NDArray[np.uint8],
@@ -49,17 +47,13 @@ def view_map(
     cam_from_world: NDArray[np.float64],
 ) -> MapView:
     """Draw the map from `cam_from_world` (4, 4). The depth is that of the surface at which half the light is lost."""
-    m = gaussian_map
-    pose = torch.as_tensor(cam_from_world, dtype=torch.float64, device=m.means.device)
-    features = torch.cat([m.colors, m.class_logits], dim=1)
-    drawn = render(m.means, m.radii, m.opacities, features, pose, intrinsics)
-    depth = median_depth(m.means, m.radii, m.opacities, pose, intrinsics).cpu().numpy()
-    coverage = drawn.silhouette.cpu().numpy()
-    channels = decided_channels(drawn.features[..., 3:]).cpu().numpy()
+    seen = render_all(gaussian_map, torch.as_tensor(cam_from_world, dtype=torch.float64), intrinsics)
+    coverage = seen.silhouette.cpu().numpy()
+    solid = coverage >= _SEEN
     return MapView(
-        color=drawn.features[..., :3].clamp(0, 1).cpu().numpy().astype(np.float32),
-        depth=np.where(coverage >= _SEEN, depth, 0).astype(np.float32),
-        labels=labels_of_channels(np.where(coverage >= _SEEN, channels, -1), label_of_channel),
+        color=seen.colors.clamp(0, 1).cpu().numpy().astype(np.float32),
+        depth=np.where(solid, seen.median.cpu().numpy(), 0).astype(np.float32),
+        labels=labels_of_channels(np.where(solid, seen.channels.cpu().numpy(), -1), label_of_channel),
         coverage=coverage.astype(np.float32),
     )
 
@@ -71,13 +65,10 @@ def render_outcome(outcome: Outcome, cam_from_world: NDArray[np.float64]) -> Map
 
 def _color_table(name: int) -> Picture:
     """(256, 3) RGB."""
-    return np.asarray(cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], name), np.uint8).reshape(256, 3)[
-        :, ::-1
-    ]
+    return np.asarray(cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], name), np.uint8)[:, 0, ::-1]
 
 
-_TURBO = _color_table(cv2.COLORMAP_TURBO)
-_MAGMA = _color_table(cv2.COLORMAP_MAGMA)
+_TURBO, _MAGMA = _color_table(cv2.COLORMAP_TURBO), _color_table(cv2.COLORMAP_MAGMA)
 _VOID_COLOR = (40, 40, 40)
 
 
@@ -97,6 +88,14 @@ def depth_range(depth: NDArray) -> tuple[float, float]:
         return 1.0, 2.0
     low, high = np.quantile(known, (0.02, 0.98))
     return float(low), float(max(high, 1.01 * low))
+
+
+def common_depth_range(outcome: Outcome) -> tuple[float, float]:
+    """Find one range for all pictures of a run, so that their colours compare, from a few of its views."""
+    t = outcome.trajectory
+    poses = spread_sample(list(t.cam_from_world[t.is_posed]), 5)
+    ranges = [depth_range(render_outcome(outcome, pose).depth) for pose in poses]
+    return min(r[0] for r in ranges), max(r[1] for r in ranges)
 
 
 def error_picture(error: NDArray, known: NDArray[np.bool_], largest: float) -> Picture:
@@ -128,20 +127,16 @@ def labels_on_photo(
 def sheet(rows: Sequence[Sequence[Picture]], titles: Sequence[str], width: int = 320) -> Picture:
     """Rows of pictures of one shape under their titles, each reduced to `width` pixels."""
     height = round(width * rows[0][0].shape[0] / rows[0][0].shape[1])
-    lines = [_titles(titles, width)]
+    head = np.full((26, (width + 4) * len(titles), 3), 255, np.uint8)
+    for i, title in enumerate(titles):
+        at = (i * (width + 4) + 4, 18)
+        cv2.putText(head, title, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (30, 30, 30), 1, cv2.LINE_AA)
+    lines = [head]
     for row in rows:
         resized = [np.asarray(cv2.resize(p, (width, height), interpolation=cv2.INTER_AREA), np.uint8) for p in row]
         bordered = [np.pad(p, ((0, 4), (0, 4), (0, 0)), constant_values=255) for p in resized]
         lines.append(np.concatenate(bordered, axis=1))
     return np.concatenate(lines, axis=0)
-
-
-def _titles(titles: Sequence[str], width: int) -> Picture:
-    line = np.full((26, (width + 4) * len(titles), 3), 255, np.uint8)
-    for i, title in enumerate(titles):
-        at = (i * (width + 4) + 4, 18)
-        cv2.putText(line, title, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (30, 30, 30), 1, cv2.LINE_AA)
-    return line
 
 
 def class_colors_by_name(

@@ -1,14 +1,21 @@
-"""The evaluation on disk: figures, their table in Markdown, images."""
+"""The evaluation on disk: figures, their table in Markdown, images; and the demo, which is evaluated with its truth."""
 
+import zipfile
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...formats.atomic import write_text
-from ...formats.datasets import Dataset
+from ...formats.atomic import write_bytes, write_text
+from ...formats.datasets import Dataset, open_sequence
+from ...formats.errors import InputError
 from ...formats.images import write_rgb
 from ...formats.textfile import write_json
-from ..geometry.se3 import Similarity, align_points
+from ...formats.video import VideoReader
+from ..geometry.se3 import align_points
 from ..outcome import Outcome, load_outcome, spread_sample
 from ..run.files import MESH
 from ..run.folder import RunFolder
@@ -86,20 +93,17 @@ def trajectory_plots(outcome: Outcome, matched: MatchedTruth | None, upright: bo
     centers = np.where(t.is_posed[:, None], t.centers, np.nan)
     truth, unit = np.full_like(centers, np.nan), unit_name(outcome)
     if matched is not None and (both := t.is_posed & matched.has_pose).sum() >= 3:
-        found = _aligned(
-            centers[both], matched.world_from_cam[both, :3, 3], not (outcome.metric and matched.sequence.metric)
-        )
-        if found is not None:
-            centers, truth = found.apply(centers), matched.world_from_cam[:, :3, 3]
-            unit = "m" if matched.sequence.metric else FREE_UNIT
+        true, is_metric = matched.world_from_cam[:, :3, 3], matched.sequence.metric
+        with suppress(ValueError):  # a path along one line has no alignment; it is drawn as it is
+            found = align_points(centers[both], true[both], not (outcome.metric and is_metric))
+            centers, truth, unit = found.apply(centers), true, "m" if is_metric else FREE_UNIT
     axes = np.eye(3) if upright else _main_axes(centers[np.isfinite(centers).all(axis=1)])
     plots = []
     for name, x, y in (("Camera path from above", 0, 1), ("Camera path from the side", 0, 2)):
-        lines = [Line(_projected(centers, axes, x, y), BLUE, "this run")]
-        if np.isfinite(truth).any():
-            # Rows without truth would tear the line: it is drawn over those that have one.
-            known = truth[np.isfinite(truth).all(axis=1)]
-            lines.insert(0, Line(_projected(known, axes, x, y), GREY, "truth", dashed=True))
+        lines = [Line(centers @ axes[[x, y]].T, BLUE, "this run")]
+        # Rows without truth would tear the line: it is drawn over those that have one.
+        if len(known := truth[np.isfinite(truth).all(axis=1)]):
+            lines.insert(0, Line(known @ axes[[x, y]].T, GREY, "truth", dashed=True))
         plots.append(plot(name, unit, unit, lines, equal=True))
     return plots[0], plots[1]
 
@@ -111,13 +115,6 @@ def unit_name(outcome: Outcome) -> str:
     return "units" if outcome.metres is None else f"units (1 ≈ {outcome.metres.per_unit:.2g} m)"
 
 
-def _aligned(centers: np.ndarray, truth: np.ndarray, with_scale: bool) -> Similarity | None:
-    try:
-        return align_points(centers, truth, with_scale)
-    except ValueError:  # a path along one line has no alignment; it is drawn as it is
-        return None
-
-
 def _main_axes(points: np.ndarray) -> np.ndarray:
     """(3, 3) rows: directions of largest to smallest extent."""
     if len(points) < 3:
@@ -125,10 +122,6 @@ def _main_axes(points: np.ndarray) -> np.ndarray:
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=True)[2]
     # A fixed sign, so that the picture does not flip between two runs.
     return axes * np.where(axes[np.arange(3), np.abs(axes).argmax(axis=1)] < 0, -1, 1)[:, None]
-
-
-def _projected(points: np.ndarray, axes: np.ndarray, x: int, y: int) -> np.ndarray:
-    return points @ axes[[x, y]].T
 
 
 def comparison_sheet(outcome: Outcome, matched: MatchedTruth, views: int = SHEET_VIEWS) -> Picture:
@@ -176,129 +169,166 @@ def evaluation_table(result: dict[str, Any], with_protocol: bool = True) -> str:
     return "\n".join(lines) + "\n"
 
 
+class _Figure(float):
+    """A number of which "c" writes hundreds of: centimetres of a length in metres."""
+
+    def __format__(self, form: str) -> str:
+        return f"{100 * self:{form[:-1] or '.2'}f}" if form.endswith("c") else super().__format__(form)
+
+
+def _row(name: str, cells: dict[str, Any], text: str, of: str = "") -> Row:
+    """A row of the table, its texts filled in with the cells; why it is empty where it is."""
+    if "missing" in cells:
+        return (name, "–", cells["missing"])
+    shown = {key: _Figure(v) if isinstance(v, float) else v for key, v in cells.items()}
+    return (name, text.format_map(shown), of.format_map(shown))
+
+
 def evaluation_rows(result: dict[str, Any]) -> list[Row]:
     """The cells under `TABLE_HEADER`."""
-    stage = result["stage"]
-    frames = result["frames"]
-    of = f"{frames['picked']} picked, {frames['keyframes']} keyframes, {frames['with true pose']} with a true pose"
+    frames, camera = result["frames"], result["camera"]
+    of = "{picked} picked, {keyframes} keyframes, {with true pose} with a true pose"
     if "images" in frames:
-        of += f"; of the source's {frames['images']} images {frames['images posed']} are posed"
+        of += "; of the source's {images} images {images posed} are posed"
     if frames.get("by rotation alone"):
-        of += f"; {frames['by rotation alone']} by rotation alone, which no error of a place counts"
-    rows = [("frames posed", str(frames["posed"]), of), _camera_row(result["camera"])]
-    rows += _trajectory_rows(result["trajectory"], stage["poses"], result["unit"])
-    rows += _scale_rows(result["scale"])
+        of += "; {by rotation alone} by rotation alone, which no error of a place counts"
+    rows = [_row("frames posed", frames, "{posed}", of)]
+    why = camera.get("missing")
+    known = {key: value for key, value in camera.items() if key != "missing"}
+    px, origin = ("{fx:.1f} px", f"{{origin}}; {why}") if why else ("{fx:.1f} px ({focal error:+.2%})", "{origin}")
+    rows += [_row("focal length", known, px, origin), *_trajectory_rows(result)]
+    estimated = ", estimated" if result["scale"].get("guess") else ""
+    stated = "{stated:.4g} ± {relative sd:.1%}" + estimated
+    rows.append(_row("metres per unit", result["scale"], stated, "true {true:.4g}, {sigmas:.1f} sigmas off"))
     if (psnr := result["keyframe psnr"]) is not None:
         rows.append(("PSNR at keyframes", f"{psnr:.2f} dB", "as in status and report: at the map's own image size"))
-    rows += _image_rows(result["images"], stage["map"])
-    rows += _depth_rows(result["depth"]) + _label_rows(result["labels"]) + _mesh_rows(result["mesh"])
+    rows += _image_rows(result["images"], result["stage"]["map"])
+    rows += _depth_rows(result["depth"]) + _label_rows(result["labels"])
+    name = "mesh" if "missing" in result["mesh"] else "mesh accuracy, completeness, F-score"
+    mesh = "{accuracy:c} cm, {completeness:c} cm, {f_score:.1%}"
+    rows.append(_row(name, result["mesh"], mesh, "F-score at {threshold:.0c} cm"))
     return rows + _cost_rows(result["cost"])
 
 
-def _missing(name: str, group: dict[str, Any]) -> list[Row]:
-    return [(name, "–", group["missing"])]
-
-
-def _camera_row(camera: dict[str, Any]) -> Row:
-    if "missing" in camera:
-        return ("focal length", f"{camera['fx']:.1f} px", f"{camera['origin']}; {camera['missing']}")
-    return ("focal length", f"{camera['fx']:.1f} px ({camera['focal error']:+.2%})", camera["origin"])
-
-
-def _trajectory_rows(cells: dict[str, Any], stage: str, unit: str) -> list[Row]:
+def _trajectory_rows(result: dict[str, Any]) -> list[Row]:
+    cells, unit, stage = result["trajectory"], result["unit"], result["stage"]["poses"]
     if "missing" in cells:
-        return _missing("trajectory", cells)
+        return [_row("trajectory", cells, "")]
+    form, unit = ("c", "cm") if unit == "m" else (".3g", unit)
+    names = ("rmse", "mean", "median", "max")
+    values = " / ".join(f"{{{name}:{form}}}" for name in names) + f" {unit}"
     rows = []
-
-    def lengths(*values: float) -> str:
-        if unit != "m":
-            return " / ".join(f"{v:.3g}" for v in values) + f" {unit}"
-        return " / ".join(f"{100 * v:.2f}" for v in values) + " cm"
-
-    for key, name in (("sim3", "ATE Sim(3)"), ("se3", "ATE SE(3)")):
+    for key, name, scale in (("sim3", "ATE Sim(3)", ", scale {scale:.4f}"), ("se3", "ATE SE(3)", "")):
         for frames in ("all", "keyframes", "every image"):
-            if (cell := cells.get(f"{key} {frames}")) is None:
-                continue
-            if "missing" in cell:
-                rows += _missing(f"{name}, {frames}", cell)
-                continue
-            text = lengths(*(cell[k] for k in ("rmse", "mean", "median", "max")))
-            scale = f", scale {cell['scale']:.4f}" if key == "sim3" else ""
-            rows.append((f"{name}, {frames}: rmse / mean / median / max", text, f"{cell['frames']} frames{scale}"))
-    rpe = cells["rpe"]
-    text = f"{lengths(rpe['translation rmse'])}, {rpe['rotation rmse degrees']:.3f}°"
-    return [*rows, ("RPE rmse", text, f"{rpe['pairs']} pairs, poses of {stage}")]
-
-
-def _scale_rows(cells: dict[str, Any]) -> list[Row]:
-    if "missing" in cells:
-        return _missing("metres per unit", cells)
-    text = f"{cells['stated']:.4g} ± {cells['relative sd']:.1%}{', estimated' if cells['guess'] else ''}"
-    return [("metres per unit", text, f"true {cells['true']:.4g}, {cells['sigmas']:.1f} sigmas off")]
+            if (cell := cells.get(f"{key} {frames}")) is not None:
+                title = f"{name}, {frames}" + ("" if "missing" in cell else f": {' / '.join(names)}")
+                rows.append(_row(title, cell, values, "{frames} frames" + scale))
+    text = f"{{translation rmse:{form}}} {unit}, {{rotation rmse degrees:.3f}}°"
+    return [*rows, _row("RPE rmse", cells["rpe"], text, f"{{pairs}} pairs, poses of {stage}")]
 
 
 def _image_rows(cells: dict[str, Any], stage: str) -> list[Row]:
     if "missing" in cells:
-        return _missing("PSNR, SSIM", cells)
-    rows: list[Row] = []
+        return [_row("PSNR, SSIM", cells, "")]
+    rows = []
     for kind, cell in cells.items():
-        if "missing" in cell:
-            rows += _missing(f"PSNR, SSIM {kind}", cell)
-            continue
-        text = f"{_text(cell['psnr'], '.2f')} dB, {cell['ssim']:.4f}"
-        rows.append((f"PSNR, SSIM {kind}", text, f"{cell['views']} views at full size, map of {stage}"))
+        text = ("– dB" if cell.get("psnr") is None else "{psnr:.2f} dB") + ", {ssim:.4f}"
+        rows.append(_row(f"PSNR, SSIM {kind}", cell, text, f"{{views}} views at full size, map of {stage}"))
     lpips = {kind: cell["lpips"] for kind, cell in cells.items() if "lpips" in cell}
     known = [f"{kind} {value:.4f}" for kind, value in lpips.items() if isinstance(value, float)]
     if known:
         return [*rows, ("LPIPS", ", ".join(known), "AlexNet")]
-    return rows + [row for value in list(lpips.values())[:1] for row in _missing("LPIPS", value)]
+    return rows + [_row("LPIPS", value, "") for value in list(lpips.values())[:1]]
 
 
 def _depth_rows(cells: dict[str, Any]) -> list[Row]:
     if "missing" in cells:
-        return _missing("depth L1", cells)
-    of = f"{cells['valid_fraction']:.1%} of the pixels with truth"
-    metric = cells["metric_l1"]
-    first = _missing("depth L1, metric", metric) if isinstance(metric, dict) else []
-    first = first or [("depth L1, metric", f"{100 * metric:.2f} cm", of)]
+        return [_row("depth L1", cells, "")]
+    of, metric = "{valid_fraction:.1%} of the pixels with truth", cells["metric_l1"]
+    first = metric if isinstance(metric, dict) else cells
     return [
-        *first,
-        ("depth L1, after one scale", f"{100 * cells['scaled_l1']:.2f} cm", f"{of}, × {cells['scale']:.4f}"),
+        _row("depth L1, metric", first, "{metric_l1:c} cm", of),
+        _row("depth L1, after one scale", cells, "{scaled_l1:c} cm", of + ", × {scale:.4f}"),
     ]
 
 
 def _label_rows(cells: dict[str, Any]) -> list[Row]:
-    if "clustering" in cells:
-        rows = _missing("mIoU, pixel accuracy", cells)
-        for name, cell in cells["clustering"].items():
-            text = f"{cell['mean_iou']:.2%}, {cell['pixel_accuracy']:.2%}"
-            rows.append((f"as a clustering, {name} (classes named by the truth)", text, cells["input"]))
-        return rows
+    text = "{mean_iou:.2%}, {pixel_accuracy:.2%}"
     if "missing" in cells:
-        return _missing("mIoU, pixel accuracy", cells)
-    of = f"{cells['input']}, {cells['matching']}; over {len(cells['class_iou'])} classes of the truth"
+        rows = [_row("mIoU, pixel accuracy", cells, "")]
+        for name, cell in cells.get("clustering", {}).items():
+            rows.append(_row(f"as a clustering, {name} (classes named by the truth)", cell, text, cells["input"]))
+        return rows
+    of = f"{{input}}, {{matching}}; over {len(cells['class_iou'])} classes of the truth"
     classes = ", ".join(f"{n} {v:.1%}" for n, v in sorted(cells["class_iou"].items(), key=lambda item: -item[1]))
     return [
-        ("mIoU, pixel accuracy", f"{cells['mean_iou']:.2%}, {cells['pixel_accuracy']:.2%}", of),
+        _row("mIoU, pixel accuracy", cells, text, of),
         ("IoU of each class", classes, f"{cells['unlabelled']:.1%} of the pixels were given none of them"),
     ]
-
-
-def _mesh_rows(cells: dict[str, Any]) -> list[Row]:
-    if "missing" in cells:
-        return _missing("mesh", cells)
-    text = f"{100 * cells['accuracy']:.2f} cm, {100 * cells['completeness']:.2f} cm, {cells['f_score']:.1%}"
-    return [("mesh accuracy, completeness, F-score", text, f"F-score at {100 * cells['threshold']:.0f} cm")]
 
 
 def _cost_rows(cells: dict[str, Any]) -> list[Row]:
     stages = ", ".join(f"{name} {s:.1f}" for name, s in cells["seconds"].items())
     return [
-        ("time", f"{cells['total seconds']:.1f} s", f"{cells['frames per second']:.2f} frames/s; {stages}"),
-        ("peak memory", f"{cells['peak memory MB']:.0f} MB", ""),
-        ("map", f"{cells['gaussians']} Gaussians", f"{cells['map MB']:.1f} MB"),
+        _row("time", cells, "{total seconds:.1f} s", f"{{frames per second:.2f}} frames/s; {stages}"),
+        _row("peak memory", cells, "{peak memory MB:.0f} MB"),
+        _row("map", cells, "{gaussians} Gaussians", "{map MB:.1f} MB"),
     ]
 
 
-def _text(value: Any, form: str = ".4f") -> str:
-    return format(value, form) if isinstance(value, float) else ("–" if value is None else str(value))
+VIDEO, TRUTH = "room.mp4", "room_truth"
+CLIP = Path(__file__).with_name("demo_clip")
+"""The video, and its truth without the images as a zip: 36 frames of a made-up room (tests/world/demo_clip.py)."""
+
+_SUMMARY = ("frames posed", "ATE Sim(3), all", "PSNR at keyframes", "focal length", "depth L1, after one scale")
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """The run of a demo and the figures of `evaluate_outcome`."""
+
+    run: RunFolder
+    figures: dict[str, Any]
+
+
+def unpack_demo_clip(folder: Path, clip: Path = CLIP) -> tuple[Path, Path]:
+    """Put the video and, in a folder beside it, its truth into `folder`; returns both paths. What is there stays.
+
+    Raises InputError when the folder holds another video of that name or cannot be written.
+    """
+    video, truth, content = folder / VIDEO, folder / TRUTH, (clip / VIDEO).read_bytes()
+    if video.exists():
+        if video.read_bytes() != content:
+            raise InputError(f"{video} is there already and is not the demo's. Choose another folder")
+        return video, truth
+    for frame in VideoReader(clip / VIDEO):
+        write_rgb(truth / "rgb" / f"{frame.source_index:06d}.png", frame.rgb)
+    with zipfile.ZipFile(clip / f"{TRUTH}.zip") as archive:
+        archive.extractall(truth)
+    write_bytes(video, content)  # last: where it is, the truth is whole
+    return video, truth
+
+
+def run_demo(
+    folder: Path, reconstruct: Callable[[Path, RunFolder], Any], progress: Progress, clip: Path = CLIP
+) -> DemoResult:
+    """Unpack the clip, have it reconstructed from the video alone (`reconstruct(video, run)`), evaluate the run.
+
+    The truth is opened only after the reconstruction has ended. Raises InputError as the steps do.
+    """
+    video, truth = unpack_demo_clip(folder, clip)
+    run = RunFolder(folder / "room.msgs")
+    reconstruct(video, run)
+    figures = write_evaluation(run, open_sequence(truth), progress)
+    return DemoResult(run, figures)
+
+
+def demo_summary(result: DemoResult) -> list[str]:
+    """Return a few lines for a person: the errors, and where to look."""
+    lines = [
+        f"{what.partition(':')[0]}: {value} ({of})"
+        for what, value, of in evaluation_rows(result.figures)
+        if what.startswith(_SUMMARY)
+    ]
+    folder = result.run.evaluation_file.parent
+    return [*lines, f"images: {folder / 'views.png'}", f"tables: {folder / 'evaluation.md'}"]

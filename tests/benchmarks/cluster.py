@@ -30,7 +30,7 @@ os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112  with its 15 anything el
 
 from msgs_slam.formats.reading import file_sha256
 from msgs_slam.pipelines.config import STAGES
-from msgs_slam.pipelines.evaluation.demo import unpack_demo_clip
+from msgs_slam.pipelines.evaluation.write import unpack_demo_clip
 
 WITH_TASKS = {
     "frames": "snapshot",

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.video import VideoReader
 from msgs_slam.formats.video_writer import write_video
-from msgs_slam.pipelines.evaluation.demo import CLIP, VIDEO
 from msgs_slam.pipelines.evaluation.report import write_report
+from msgs_slam.pipelines.evaluation.write import CLIP, VIDEO
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder

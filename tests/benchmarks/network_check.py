@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.msgs_cli.doctor import print_findings
-from msgs_slam.pipelines.evaluation.demo import unpack_demo_clip
+from msgs_slam.pipelines.evaluation.write import unpack_demo_clip
 from msgs_slam.pipelines.geometry.voxels import normals_in_cam
 from msgs_slam.pipelines.networks.card import Card, read_card
 from msgs_slam.pipelines.networks.outputs import network_depth, network_probabilities

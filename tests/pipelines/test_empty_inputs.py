@@ -22,7 +22,7 @@ from msgs_slam.pipelines.depth.fields import contradicted
 from msgs_slam.pipelines.evaluation.film import orbit, resampled, smoothed
 from msgs_slam.pipelines.evaluation.html import Line, plot
 from msgs_slam.pipelines.evaluation.labels import matched_one_to_one, score
-from msgs_slam.pipelines.evaluation.metrics import DepthError, DepthErrorSum, depth_points, seen_in_depth, thinned
+from msgs_slam.pipelines.evaluation.metrics import DepthError, DepthErrorSum, sees, thinned
 from msgs_slam.pipelines.evaluation.truth import associate
 from msgs_slam.pipelines.evaluation.views import depth_picture, depth_range, view_map
 from msgs_slam.pipelines.export.colmap import seen_points
@@ -167,7 +167,7 @@ def few_pixels() -> Iterator[Any]:
         photo, k = np.zeros((*size, 3), np.uint8), camera(*size)
         for depth in (full(size, 0), full(size, 2), full(size, np.nan)):
             yield lambda d=depth: depth_picture(d, *depth_range(d))
-            yield lambda d=depth, k=k: seen_in_depth(depth_points(d, k, EYE), d, k, EYE, 0.1)
+            yield lambda v=PosedDepth(k, EYE, depth, depth): sees(v, v.in_world(*v.grid(320)[:2]))
             yield lambda d=depth: added(d, 0 * d)
             yield lambda d=depth: added(0 * d, d)
             yield lambda d=depth: (complete_depth(d, 0 * d), fill_smoothly(d, 0 * d))

@@ -5,7 +5,7 @@ import zipfile
 from pathlib import Path
 
 from msgs_slam.formats.video_writer import write_video
-from msgs_slam.pipelines.evaluation.demo import CLIP, TRUTH, VIDEO
+from msgs_slam.pipelines.evaluation.write import CLIP, TRUTH, VIDEO
 from tests.world import ClipOptions, iter_clip, make_world, write_sequence
 
 OPTIONS = ClipOptions(frames=36, width=320, height=240, fps=10.0, laps=0.32)

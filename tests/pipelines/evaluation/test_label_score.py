@@ -7,6 +7,7 @@ import pytest
 
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.evaluation.labels import (
+    Matching,
     count_labels,
     indices_by_name,
     label_cells,
@@ -15,7 +16,6 @@ from msgs_slam.pipelines.evaluation.labels import (
     matched_one_to_one,
     open_class_map,
     read_class_map,
-    renamed,
     score,
     shipped_maps,
 )
@@ -67,23 +67,22 @@ def test_flipped_pixels_cost_what_theory_says(share: float) -> None:
     assert found.mean_iou == pytest.approx((1 - share) / (1 + share), abs=0.01)
 
 
+def clustered(confusion: np.ndarray, match: np.ndarray) -> float:
+    found = score(Matching(("a", "b", "c", "d"), match, np.arange(4), "").joined(confusion))
+    assert found is not None
+    return found.mean_iou
+
+
 def test_renamed_classes_are_matched_back() -> None:
     rng = np.random.default_rng(2)
     truth = rng.integers(0, 4, (60, 60))
     clusters = np.array([2, 0, 3, 1])[truth]
     confusion = count_labels(clusters, truth, 6, 4)
-    assert matched_one_to_one(confusion)[:4].tolist() == [1, 3, 0, 2]
-    assert matched_one_to_one(confusion)[4:].tolist() == [-1, -1]
-    found = score(renamed(confusion, matched_one_to_one(confusion)))
-    assert found is not None
-    assert found.mean_iou == 1
-    split = np.where(rng.random(truth.shape) < 0.3, clusters + 4, clusters)
-    by_majority = score(renamed(c := count_labels(split, truth, 8, 4), matched_by_majority(c)))
-    one_to_one = score(renamed(c, matched_one_to_one(c)))
-    assert by_majority is not None
-    assert one_to_one is not None
-    assert by_majority.mean_iou == 1
-    assert one_to_one.mean_iou == pytest.approx(0.7, abs=0.03)
+    assert matched_one_to_one(confusion).tolist() == [1, 3, 0, 2, -1, -1]
+    assert clustered(confusion, matched_one_to_one(confusion)) == 1
+    split = count_labels(np.where(rng.random(truth.shape) < 0.3, clusters + 4, clusters), truth, 8, 4)
+    assert clustered(split, matched_by_majority(split)) == 1
+    assert clustered(split, matched_one_to_one(split)) == pytest.approx(0.7, abs=0.03)
 
 
 def test_names_find_each_other() -> None:
