@@ -88,6 +88,8 @@ def evaluate_outcome(
             log.warning("class map %s: there is no class %s. What joins only these is left out", class_map.name, listed)
     matching = match_classes(outcome.classes.names, outcome.vocabulary, truth.class_names, class_map)
     trajectory, alignment = trajectory_cells(outcome, matched)
+    usable = outcome.trajectory.frame_ids[outcome.trajectory.is_placed & matched.has_pose]
+    errors = [] if alignment is None else [[int(i), float(e)] for i, e in zip(usable, alignment.errors, strict=True)]
     why = {"missing": f"mapping is not done; the last stage is {outcome.pose_stage}"}
     of_map: dict[str, Any] = {"images": why, "depth": why, "labels": why, "views": []}
     if outcome.gaussian_map is not None:
@@ -106,7 +108,7 @@ def evaluate_outcome(
         "camera": camera_cells(outcome, truth),
         "trajectory": trajectory,
         "scale": scale_cells(outcome, trajectory, truth),
-        "frame errors": frame_errors(outcome, matched, alignment),
+        "frame errors": errors,
         "keyframe psnr": outcome.keyframe_psnr,
         **of_map,
         "mesh": mesh_cells(outcome, matched, alignment),
@@ -187,14 +189,6 @@ def scale_cells(outcome: Outcome, trajectory: dict[str, Any], truth: Dataset) ->
     m = outcome.metres
     sigmas = abs(np.log(m.per_unit / true)) / m.relative_sd
     return {"stated": m.per_unit, "relative sd": m.relative_sd, "guess": m.is_guess, "true": true, "sigmas": sigmas}
-
-
-def frame_errors(outcome: Outcome, matched: MatchedTruth, alignment: AbsoluteError | None) -> list[list[float]]:
-    """[frame id, error in the truth's unit] of every frame that the alignment was made from."""
-    if alignment is None:
-        return []
-    ids = outcome.trajectory.frame_ids[outcome.trajectory.is_placed & matched.has_pose]
-    return [[int(i), float(e)] for i, e in zip(ids, alignment.errors, strict=True)]
 
 
 def _ate(centers: NDArray, true_centers: NDArray, with_scale: bool) -> dict[str, Any]:

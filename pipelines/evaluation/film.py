@@ -73,7 +73,7 @@ def render_run(
     place = _target(target, 30.0 if fps is None else fps, overwrite)
     given = None if path in PATHS else _given_path(Path(path), fps)
     rate = given.fps if given else 30.0 if fps is None else fps
-    flight = given and given.in_world_of_run(run)
+    flight = None if given is None else given.in_world_of_run(run)
     outcome = load_outcome(run)
     outcome.require_map()
     outcome = outcome if size is None else _of_size(outcome, size)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-BLUE, ORANGE, GREY, RED, GREEN = "#2563eb", "#ea580c", "#9ca3af", "#dc2626", "#16a34a"
+BLUE, GREY, RED = "#2563eb", "#9ca3af", "#dc2626"
 
 STYLE = """
 :root{--ink:#111827;--soft:#6b7280;--line:#e5e7eb;--card:#fff;--back:#f3f4f6;--accent:#2563eb}
@@ -134,11 +134,8 @@ def plot(
     height: int = 320,
 ) -> str:
     """One SVG. `equal`: the same scale on both axes. What is not finite is left out."""
-    groups = [g.points[np.isfinite(g.points).all(axis=1)] for g in lines if len(g.points)]
-    every = np.concatenate(groups) if groups else np.zeros((0, 2))
-    if len(every) == 0:
-        every = np.array([[0.0, 0.0], [1.0, 1.0]])
-    frame = _Frame.around(every, width, height, equal)
+    every = np.concatenate([np.zeros((0, 2)), *(g.points[np.isfinite(g.points).all(axis=1)] for g in lines)])
+    frame = _Frame.around(every if len(every) else np.eye(2), width, height, equal)
     parts = [
         f'<svg viewBox="0 0 {width} {height}" class="plot" role="img" aria-label="{escape(title)}" '
         'xmlns="http://www.w3.org/2000/svg" font-family="system-ui, sans-serif" font-size="11">',
@@ -193,14 +190,14 @@ def ticks(low: float, high: float, about: int = 6) -> list[float]:
 
 def _grid(frame: _Frame) -> str:
     parts = []
-    for x in ticks(frame.low[0], frame.high[0]):
-        at = float(frame.place(np.array([[x, frame.low[1]]]))[0, 0])
-        parts.append(f'<line x1="{at:.1f}" x2="{at:.1f}" y1="{frame.top}" y2="{frame.bottom}" stroke="#e5e7eb"/>')
-        parts.append(f'<text x="{at:.1f}" y="{frame.bottom + 14}" text-anchor="middle" fill="#4b5563">{x:.6g}</text>')
-    for y in ticks(frame.low[1], frame.high[1], 5):
-        at = float(frame.place(np.array([[frame.low[0], y]]))[0, 1])
-        parts.append(f'<line y1="{at:.1f}" y2="{at:.1f}" x1="{frame.left}" x2="{frame.right}" stroke="#e5e7eb"/>')
-        parts.append(f'<text x="{frame.left - 5}" y="{at + 4:.1f}" text-anchor="end" fill="#4b5563">{y:.6g}</text>')
+    for axis, about in ((0, 6), (1, 5)):
+        for value in ticks(frame.low[axis], frame.high[axis], about):
+            x, y = frame.place(np.where(np.arange(2) == axis, value, frame.low)[None])[0]
+            ends = (x, x, frame.top, frame.bottom) if axis == 0 else (frame.left, frame.right, y, y)
+            at = (x, frame.bottom + 14, "middle") if axis == 0 else (frame.left - 5, y + 4, "end")
+            parts.append('<line x1="{:.1f}" x2="{:.1f}" y1="{:.1f}" y2="{:.1f}" stroke="#e5e7eb"/>'.format(*ends))
+            head = '<text x="{:.1f}" y="{:.1f}" text-anchor="{}" fill="#4b5563">'.format(*at)
+            parts.append(f"{head}{value:.6g}</text>")
     return "".join(parts)
 
 

@@ -1,7 +1,7 @@
 """One HTML file about a run that opens anywhere, without a network."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from ...formats.reading import read_bytes
 from ...formats.textfile import read_json, read_text
 from ..config import Config, config_to_dict
 from ..export.kinds import IMAGES, README, WEB_PAGE
-from ..export.readme import lengths
+from ..export.scene import lengths
 from ..geometry.sparse_model import SparseModel
 from ..outcome import Outcome, load_outcome, spread_sample
 from ..read_config import config_to_toml
@@ -28,36 +28,11 @@ from ..source.sharpness import at_most_wide
 from ..system.progress import Progress, SilentProgress
 from ..system.wording import figure_text, quoted
 from ..types import VOID, LoopEdge
-from .facts import Capture, advice, found_lengths, lost_stretches, read_capture
-from .html import (
-    BLUE,
-    GREY,
-    ORANGE,
-    RED,
-    Line,
-    bullets,
-    chips,
-    drawing,
-    image,
-    legend,
-    page,
-    plot,
-    section,
-    table,
-)
-from .metrics import psnr
+from .facts import advice, found_lengths, lost_stretches, read_capture
+from .html import RED, Line, bullets, chips, drawing, image, legend, page, plot, section, table
 from .views import Picture, common_depth_range, depth_picture, labels_on_photo, mesh_picture, render_outcome
-from .write import (
-    JUDGED,
-    PATH_FROM_ABOVE,
-    TABLE_HEADER,
-    evaluation_rows,
-    identity_of,
-    trajectory_plots,
-    unit_name,
-)
+from .write import JUDGED, PATH_FROM_ABOVE, TABLE_HEADER, evaluation_rows, identity_of, trajectory_plots, unit_name
 
-MEASURED_VIEWS = 60
 SHOWN_VIEWS = 8
 _TILE_WIDTH = 400
 _ROWS = 3
@@ -86,18 +61,15 @@ def _report(outcome: Outcome, target: Path, progress: Progress) -> str:
     """The HTML of the report that will be at `target`."""
     run = outcome.run
     sparse, loops = outcome.load_sparse(), run.load(LOOPS) if "global_ba" in outcome.records else []
-    capture = read_capture(outcome, sparse)
-    views = None if outcome.gaussian_map is None else render_views(outcome, progress)
     evaluation = read_json(run.evaluation_file) if run.evaluation_file.exists() else None
     body = "".join(
         [
             _heading(outcome, target),
-            "" if views is None else section("What the map shows", views.sheet, class_legend(outcome, views)),
+            "" if outcome.gaussian_map is None else section("What the map shows", _map_section(outcome, progress)),
             _mesh_section(outcome),
-            _advice_section(outcome, capture, sparse, loops),
+            _advice_section(outcome, sparse, loops),
             _found_section(outcome, sparse, loops),
             _path_section(outcome),
-            quality_section(outcome, capture, views),
             "" if evaluation is None else truth_section(evaluation, outcome),
             *(_piece_section(piece, progress) for piece in outcome.pieces()),
             _time_section(outcome),
@@ -144,9 +116,9 @@ _AFTER = {
 }
 
 
-def _advice_section(outcome: Outcome, capture: Capture, sparse: SparseModel | None, loops: list[LoopEdge]) -> str:
+def _advice_section(outcome: Outcome, sparse: SparseModel | None, loops: list[LoopEdge]) -> str:
     warned = [f"{stage}: {w}" for stage, record in outcome.records.items() for w in record.warnings]
-    lines = warned + advice(outcome, capture, sparse, loops, outcome.keyframe_psnr)
+    lines = warned + advice(outcome, read_capture(outcome, sparse), sparse, loops, outcome.keyframe_psnr)
     if not lines:
         return section("What would improve it", "<p>No problem found in this capture.</p>", kind="fine")
     return section("What would improve it", bullets(lines), kind="advice")
@@ -221,7 +193,6 @@ def _scale_text(outcome: Outcome) -> str:
 
 def _piece_section(piece: Outcome, progress: Progress) -> str:
     """A disconnected component: a run of its own inside the run, in short."""
-    views = None if piece.gaussian_map is None else render_views(piece, progress)
     t = piece.trajectory
     seconds = f"{t.timestamps[0]:.1f} to {t.timestamps[-1]:.1f}"
     name = piece.run.place.name
@@ -230,7 +201,8 @@ def _piece_section(piece: Outcome, progress: Progress) -> str:
         chips([*_figures(piece), ("seconds of the source", seconds)]),
         "<p>It is not connected to the rest: it has a coordinate system and a unit of its own. "
         f"<code>msgs-slam report {escape(quoted(piece.run.root))}</code> says more; view and render take it, too.</p>",
-        '<div class="two">', *trajectory_plots(piece, None), "</div>", "" if views is None else views.sheet,
+        '<div class="two">', *trajectory_plots(piece, None), "</div>",
+        "" if piece.gaussian_map is None else _map_section(piece, progress),
     )  # fmt: skip
 
 
@@ -307,40 +279,24 @@ def _settings_section(outcome: Outcome) -> str:
     return section("Settings", listed, whole)
 
 
-@dataclass(frozen=True)
-class RenderedViews:
-    """Rendered keyframes: ids (V,), psnr (V,), pixels of each label (256,), and a sheet as HTML."""
-
-    ids: list[int]
-    psnr: list[float]
-    class_pixels: NDArray[np.int64]
-    sheet: str
-
-
-def render_views(outcome: Outcome, progress: Progress) -> RenderedViews:
-    """Up to `MEASURED_VIEWS` keyframes, evenly spread; a few of them on the sheet."""
-    t = outcome.trajectory
-    keyframes = spread_sample(t.frame_ids[t.is_keyframe].tolist(), MEASURED_VIEWS)
-    shown = set(spread_sample(keyframes, SHOWN_VIEWS))
-    values: list[float] = []
+def _map_section(outcome: Outcome, progress: Progress) -> str:
+    """Keyframes beside the map from the same place, a few seen at once and the others unfolding; colours of depth and
+    of classes."""
+    t, reach = outcome.trajectory, common_depth_range(outcome)
+    rows = spread_sample(np.flatnonzero(t.is_keyframe).tolist(), SHOWN_VIEWS)
     pictures: list[tuple[Picture, str]] = []
-    reach = common_depth_range(outcome)
-    counts = np.zeros(256, np.int64)
-    for frame_id in progress.track(keyframes, "rendering", len(keyframes)):
-        row = outcome.frame_row(frame_id)
-        frame, photo = outcome.frames[row], outcome.run.image(outcome.frames[row])
-        view = render_outcome(outcome, t.cam_from_world[row])
-        picture = view.exposed(outcome.exposure, frame.timestamp)
-        values.append(psnr(picture, photo))
-        counts += np.bincount(view.labels.ravel(), minlength=256)
-        if frame_id in shown:
-            depth = depth_picture(view.depth, *reach)
-            labels = labels_on_photo(photo, view.labels, outcome.classes.colors)
-            pairs = ((photo, "image"), (picture, "map"), (depth, "depth"), (labels, "classes"))
-            pictures += [(drawn, f"{what}, {frame.timestamp:.2f} s") for drawn, what in pairs]
+    pixels = np.zeros(256, np.int64)
+    for row in progress.track(rows, "rendering", len(rows)):
+        frame, view = outcome.frames[row], render_outcome(outcome, t.cam_from_world[row])
+        photo = outcome.run.image(frame)
+        pixels += np.bincount(view.labels.ravel(), minlength=256)
+        depth, labels = depth_picture(view.depth, *reach), labels_on_photo(photo, view.labels, outcome.classes.colors)
+        shown = (photo, view.exposed(outcome.exposure, frame.timestamp), depth, labels)
+        captions = (f"{what}, {frame.timestamp:.2f} s" for what in ("image", "map", "depth", "classes"))
+        pictures += zip(shown, captions, strict=True)
     first, rest = pictures[: 4 * _ROWS], pictures[4 * _ROWS :]
     more = f"<details><summary>More views</summary>{_tiles(rest)}</details>" if rest else ""
-    return RenderedViews(keyframes, values, counts, _tiles(first) + more + _depth_scale(*reach, unit_name(outcome)))
+    return _tiles(first) + more + _depth_scale(*reach, unit_name(outcome)) + _class_legend(outcome, pixels)
 
 
 def _depth_scale(nearest: float, farthest: float, unit: str) -> str:
@@ -353,25 +309,9 @@ def _depth_scale(nearest: float, farthest: float, unit: str) -> str:
     return f'<div class="legend scale">depth, {escape(unit)}: {low} {bar} {high} {middle}</div>'
 
 
-def quality_section(outcome: Outcome, capture: Capture, views: RenderedViews | None) -> str:
-    """Plots over the frames."""
-    ids = np.array([f.id for f in outcome.frames])
-    series: list[tuple[str, str, NDArray, NDArray, str]] = [
-        ("Sharpness relative to the median", "", ids, capture.sharpness, ORANGE),
-        ("Mean brightness", "0..255", ids, capture.brightness, GREY),
-    ]
-    if views is not None and views.ids:
-        series.insert(0, ("PSNR of keyframes", "dB", np.array(views.ids), np.array(views.psnr), BLUE))
-    plots = (
-        plot(name, "frame", unit, [Line(np.stack([x, y], 1).astype(np.float64), color, "")], height=240)
-        for name, unit, x, y, color in series
-    )
-    return section("Quality over time", '<div class="two">', *plots, "</div>")
-
-
-def class_legend(outcome: Outcome, views: RenderedViews) -> str:
-    """Colour, name and share of each class in the rendered keyframes, largest first."""
-    shares = views.class_pixels / max(int(views.class_pixels.sum()), 1)
+def _class_legend(outcome: Outcome, pixels: NDArray[np.int64]) -> str:
+    """Colour, name and share of each class by the pixels (256,) that have it, largest first."""
+    shares = pixels / max(int(pixels.sum()), 1)
     rows = [
         (float(shares[i]), name, "rgb({},{},{})".format(*color))
         for i, (name, color) in enumerate(zip(outcome.classes.names, outcome.classes.colors, strict=True))

@@ -26,8 +26,7 @@ from ..run.files import BACKBONE, CALIBRATION, FRAMES
 from ..run.folder import RunFolder, load_records, load_settings
 from ..run.manifest import StageRecord, recorded_config
 from ..run.progress import load_run_progress
-from ..scene.upright import Upright
-from ..scene.world import WORLD, in_world, up_in_run, upright_world
+from ..scene.world import WORLD, Upright, in_world, up_in_run, upright_world
 from ..system.progress import log
 from ..system.wording import quoted
 from ..types import ClassTable, Trajectory

@@ -130,10 +130,10 @@ def comparison_sheet(outcome: Outcome, matched: MatchedTruth, views: int = SHEET
     with_truth = [int(r) for r in posed if matched.image[r] >= 0]
     rows = spread_sample(with_truth or posed.tolist(), views)
     pixels = FramePixels(outcome.calibration)
-    return sheet([_row(outcome, matched, pixels, row) for row in rows], TITLES)
+    return sheet([_pictures(outcome, matched, pixels, row) for row in rows], TITLES)
 
 
-def _row(outcome: Outcome, matched: MatchedTruth, pixels: FramePixels, row: int) -> list[Picture]:
+def _pictures(outcome: Outcome, matched: MatchedTruth, pixels: FramePixels, row: int) -> list[Picture]:
     view = render_outcome(outcome, outcome.trajectory.cam_from_world[row])
     frame, colors = outcome.frames[row], outcome.classes.colors
     index = int(matched.image[row])

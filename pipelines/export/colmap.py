@@ -36,8 +36,7 @@ from ..system.parallel import parallel_map
 from ..system.wording import stretches
 from ..types import Frame, Intrinsics
 from .kinds import IMAGES
-from .readme import lengths
-from .scene import ExportScene
+from .scene import ExportScene, lengths
 
 SPARSE = "sparse/0"
 """The folder of a COLMAP model by the name that trainers expect."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from html import escape
-from itertools import pairwise, permutations
+from itertools import combinations, pairwise, permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -229,9 +229,7 @@ def find_walls(vertices: NDArray, faces: NDArray) -> list[Wall]:
     left = upright
     while (found := max((_strongest_line(left, angle) for angle in angles), key=lambda line: line.area)).area > 0:
         here, left = left.next_to(found)
-        walls += [
-            Wall(found.place + np.array([[start], [end]]) * found.along) for start, end in _stretches(here, found)
-        ]
+        walls += [Wall(found.place + np.array([[a], [b]]) * found.along) for a, b in _stretches(here, found)]
     walls = _without_cupboards(_without_doubles(walls, upright.height), upright.height)
     walls = _without_doubles(walls + _between_ends(walls, upright), upright.height)
     return _without_doubles(_meeting(walls, upright.height), upright.height)
@@ -243,10 +241,8 @@ def _upright_faces(vertices: NDArray, faces: NDArray) -> _Faces:
     twice = np.linalg.norm(cross, axis=1)
     centers = corners.mean(axis=1)
     low, high = np.quantile(centers[:, 2], (0.01, 0.99)) if len(centers) else (0.0, 1.0)
-    rows = (twice > 0) & (np.abs(cross[:, 2]) < _LEANS * twice)
-    return _Faces(
-        centers[rows], twice[rows] / 2, np.arctan2(cross[rows, 1], cross[rows, 0]), float(low), float(high - low)
-    )
+    rows, angle = (twice > 0) & (np.abs(cross[:, 2]) < _LEANS * twice), np.arctan2(cross[:, 1], cross[:, 0])
+    return _Faces(centers, twice / 2, angle, float(low), float(high - low)).only(rows)
 
 
 def _directions(faces: _Faces) -> list[float]:
@@ -326,10 +322,7 @@ def _between_ends(walls: list[Wall], faces: _Faces) -> list[Wall]:
         wall = Wall(np.stack([first.ends[1], second.ends[0]]))
         if not 3 * step < wall.length < _BETWEEN * faces.height or _touch(first, second, step):
             continue
-        away, directions = (
-            faces.centers[:, :2] - wall.ends[0],
-            np.stack([np.cos(faces.angle), np.sin(faces.angle)], axis=1),
-        )
+        away, directions = faces.centers[:, :2] - wall.ends[0], np.stack([np.cos(faces.angle), np.sin(faces.angle)], 1)
         t = away @ wall.along
         here = (np.abs(away @ wall.normal) < 2 * step) & (t >= 0) & (t <= wall.length)
         here &= directions @ wall.normal > _SAME_WAY
@@ -363,16 +356,14 @@ def _stretches(faces: _Faces, line: _Line) -> list[tuple[float, float]]:
 def _over_gaps(pieces: list[tuple[float, float]], most: float) -> list[tuple[float, float]]:
     """Neighbours joined, the closest first, where the gap is shorter than `most` and than each of the two."""
     pieces = list(pieces)
-    while True:
-        gaps = [
-            (b[0] - a[1], k)
-            for k, (a, b) in enumerate(pairwise(pieces))
-            if b[0] - a[1] < min(most, a[1] - a[0], b[1] - b[0])
-        ]
-        if not gaps:
-            return pieces
+    while gaps := [
+        (b[0] - a[1], k)
+        for k, (a, b) in enumerate(pairwise(pieces))
+        if b[0] - a[1] < min(most, a[1] - a[0], b[1] - b[0])
+    ]:
         _, k = min(gaps)
         pieces[k : k + 2] = [(pieces[k][0], pieces[k + 1][1])]
+    return pieces
 
 
 def _without_doubles(walls: list[Wall], height: float) -> list[Wall]:
@@ -410,18 +401,14 @@ def _without_cupboards(walls: list[Wall], height: float) -> list[Wall]:
 
 def _meeting(walls: list[Wall], height: float) -> list[Wall]:
     """Ends that lie close to where two walls cross are moved there, the closest first."""
-    options = []
-    step = height / _STEPS
-    for i, first in enumerate(walls):
-        for j in range(i):
-            second = walls[j]
-            if abs(first.along @ second.normal) < np.sin(_APART):
-                continue
-            place = _crossing(first, second)
-            (k, far), (m, too) = (_nearest_end(w, place) for w in (first, second))
-            flat = 1 / abs(float(first.along @ second.normal))
-            if max(far, too) < _CORNER * height and min(far, too) > -3 * step * (1 + flat):
-                options.append((max(abs(far), abs(too)), (i, k), (j, m), place, flat * step / 2))
+    options, step = [], height / _STEPS
+    for (j, second), (i, first) in combinations(enumerate(walls), 2):
+        if (sine := abs(float(first.along @ second.normal))) < np.sin(_APART):
+            continue
+        place = _crossing(first, second)
+        (k, far), (m, too) = (_nearest_end(w, place) for w in (first, second))
+        if max(far, too) < _CORNER * height and min(far, too) > -3 * step * (1 + 1 / sine):
+            options.append((max(abs(far), abs(too)), (i, k), (j, m), place, step / 2 / sine))
     done: set[tuple[int, int]] = set()
     walls = list(walls)
     for _, one, other, place, blur in sorted(options, key=lambda option: option[0]):

@@ -156,7 +156,7 @@ EXPORTS = (
                 "CesiumJS 1.130 or newer",
             ),
         ),
-        "tiles.write_tiles", when="in submaps", also=("3dtiles",),
+        "splats.write_tiles", when="in submaps", also=("3dtiles",),
     ),
     Export(
         "mesh", "the surface with classes, and with a texture",

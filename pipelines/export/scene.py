@@ -17,11 +17,11 @@ from ..run.folder import RunFolder
 from ..run.stages import StageContext
 from ..scene.gps import world_on_earth
 from ..scene.metres import find_metres
-from ..scene.upright import find_upright
-from ..scene.world import FIRST, WORLD, World, in_world, upright_world
+from ..scene.world import FIRST, WORLD, World, find_upright, in_world, upright_world
 from ..types import Metres
 
 MESH_GLB = "mesh.glb"
+_FREE = "The unit of lengths is free: one camera cannot measure metres. Metric depth or --scale-ref makes them metres."
 
 
 @dataclass(frozen=True)
@@ -125,3 +125,15 @@ def finished_scene(outcome: Outcome, context: StageContext) -> ExportScene:
     if outcome.metres is not None and outcome.metres.is_guess and settings.scale == "free":
         outcome = replace(outcome, metres=None)
     return ExportScene(outcome, world, context)
+
+
+def lengths(metres: Metres | None, metric: bool) -> str:
+    """Describe the unit of length in a line or two of plain text."""
+    if metres is None:
+        return "Lengths are metres." if metric else _FREE
+    if metric:
+        return f"Lengths are metres: {metres.text}."
+    return (
+        f"{metres.text[0].upper()}{metres.text[1:]}.\n"
+        f"Coordinates are not rescaled: multiply lengths by {metres.per_unit:.3g} to have them in metres."
+    )

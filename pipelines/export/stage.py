@@ -1,32 +1,77 @@
-"""Stage 6, the files for other programs: of a run (`ExportStage`), and of a finished one on request (`export_run`)."""
+"""Stage 6, the files for other programs: of a run (`ExportStage`), and of a finished one on request (`export_run`);
+with README.txt: what each file is for, what the coordinates mean, and whose networks it rests on.
+
+Each disconnected component of a run becomes a small run inside it, RUN/piece_2 and so on, with frames, world and unit
+of length of its own. Its first stage takes them out of the run around it, the others are those of any run.
+"""
 
 import hashlib
+import re
 import tempfile
-from collections.abc import Iterable
+import textwrap
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ...formats.errors import InputError
-from ..config import STAGES, ExportConfig
+import numpy as np
+
+from ...formats.atomic import copy_file, write_text
+from ...formats.errors import InputError, RecoverableError
+from ..config import STAGES, Config, ExportConfig
+from ..networks.registry import ModelStore
 from ..outcome import load_outcome
-from ..run.files import CLASSES, MESH, METRES, SUBMAPS
-from ..run.folder import RunFolder
-from ..run.stages import StageContext
+from ..run.ending import discard
+from ..run.files import (
+    BACKBONE,
+    CALIBRATION,
+    CLASSES,
+    FEATURES,
+    FRAMES,
+    LEFT_OUT,
+    MATCHED_PAIRS,
+    MESH,
+    METRES,
+    SPARSE,
+    SUBMAPS,
+    TRAJECTORY,
+    VOCABULARY,
+    save_frames,
+)
+from ..run.folder import RunFolder, load_records
+from ..run.manifest import piece_digest
+from ..run.runner import run_stages
+from ..run.stages import Stage, StageContext
 from ..run.target import Target, read_list
-from ..scene.world import WORLD, in_world, world_figures
+from ..scene.world import FIRST, WORLD, World, in_world, world_figures
 from ..source.recording import is_of_source
 from ..system.machine import release_free_memory
-from ..system.progress import Progress, SilentProgress
+from ..system.progress import Progress, SilentProgress, WithinStage
 from ..types import Metres
-from .kinds import EXPORTS, IMAGES, NOTES, WORLD_NOTE, Export, export_of, names_of
+from .colmap import write_colmap, write_trajectory
+from .kinds import EXPORTS, IMAGES, NOTES, PIECES, README, WORLD_NOTE, Export, ExportedFile, export_of, names_of
 from .mesh import mesh_figures
-from .pieces import write_pieces
-from .readme import write_readme
-from .scene import ExportScene, estimate_metres, find_world, finished_scene
+from .scene import ExportScene, estimate_metres, find_world, finished_scene, lengths
 
 EXPORTS_FOLDER = "exports"
 """The folder in a run for what is exported on request, a folder a kind; no stage touches it."""
+WIDTH = 100
+"""Characters a line, so that it fits a terminal, an editor and the report."""
+_COLUMN = 27
+_MORE = "More kinds of files: msgs-slam export --help"
+
+_UPRIGHT = """\
+Axes: z is up, from the {source}; {height}.
+{heading}. So have trajectory.txt and mesh.ply. Trainers and viewers of splats take y for down:
+sparse/0, transforms.json and point_cloud*.ply and .sog are turned to x right, y down, z forward, (x, y, z) to
+(x, -z, y). In GLB, SPZ and USD files y is up, as these formats define it.
+"""
+_OWN_HEADING = """\
+x and y count from the middle of the camera's path, and y points where the first camera looked"""
+_FIRST = """\
+Axes: the run's own, about those of the first posed camera: x right, y down, z forward, since the gravity direction is
+unknown or was not asked for (export.axes).
+"""
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -50,12 +95,14 @@ class ExportStage:
         kinds = stage_exports(self.context.run)
         self.write(export for export in kinds if export.kind != "mesh")
         write_notes(self.scene, self.target, self.metres)
-        gaussians = len(self.scene.outcome.require_map())
+        images, gaussians = int(self.scene.outcome.trajectory.is_placed.sum()), len(self.scene.outcome.require_map())
         self.scene = self.scene.without_map()
         release_free_memory()
         self.write(export for export in kinds if export.kind == "mesh")
         write_readme(self.scene, self.target, files_in(self.target.folder))
-        return {"images": int(self.scene.outcome.trajectory.is_placed.sum()), "gaussians": gaussians, **self.figures()}
+        mesh = mesh_figures(self.target.folder / "mesh.ply")
+        world, metres = world_figures(self.scene.world), metres_figures(self.metres)
+        return {"images": images, "gaussians": gaussians, **mesh, **world, **metres}
 
     def open_scene(self) -> None:
         """Find which way is up, where on the Earth the scene is, and how many metres a unit is."""
@@ -73,11 +120,6 @@ class ExportStage:
         """Write the kinds of files that the stage makes."""
         for export in exports:
             export.writer()(self.scene, self.target)
-
-    def figures(self) -> dict[str, Any]:
-        """Return what the report and `status` say of the mesh, the world and its unit."""
-        mesh = mesh_figures(self.target.folder / "mesh.ply")
-        return {**mesh, **world_figures(self.scene.world), **metres_figures(self.metres)}
 
 
 def stage_exports(run: RunFolder) -> list[Export]:
@@ -182,3 +224,114 @@ def _origin(scene: ExportScene) -> str:
     of_run = [outcome.records[stage].content for stage in (outcome.pose_stage, outcome.map_stage)]
     numbers = [move.scale, *move.rotation.ravel().tolist(), *move.translation.tolist()]
     return hashlib.sha256(" ".join([*of_run, *map(repr, numbers)]).encode()).hexdigest()
+
+
+def write_readme(scene: ExportScene, target: Target, files: Iterable[str]) -> None:
+    """Write README.txt about those of the files, by their relative paths."""
+    outcome = scene.outcome
+    text = readme(scene.world, outcome.metres, outcome.metric, files)
+    used = licences([record.figures for record in outcome.records.values()], outcome.metres)
+    write_text(target.path(README), text + used)
+
+
+def readme(world: World, metres: Metres | None, metric: bool, files: Iterable[str] = ()) -> str:
+    """Return the text of README.txt for files in that world, by their relative paths."""
+    if world.axes == "up":
+        height = "the floor is at z = 0" if world.has_floor else "no floor was found, so z counts from that path too"
+        heading = "x is east and y north (GPS, see world.json)" if world.earth else _OWN_HEADING
+        axes = _UPRIGHT.format(source=world.source, height=height, heading=heading)
+    else:
+        axes = _FIRST
+    tops = {PIECES if name.startswith(PIECES) else name.partition("/")[0] for name in files}
+    known = [*(file for export in EXPORTS for file in export.files), *NOTES]
+    entries = [_entry(file) for file in known if not tops.isdisjoint(file.tops)]
+    lines = [" ".join(axes.split()), *lengths(metres, metric).splitlines()]
+    about = [textwrap.fill(line, WIDTH, break_on_hyphens=False) for line in lines]
+    return "\n".join(["What is in this folder", "", *entries, "", _MORE, "", *about]) + "\n"
+
+
+def _entry(file: ExportedFile) -> str:
+    """The name, and the text beside it; below it where the name is long."""
+    text = ". ".join(filter(None, [file.about, f"Opens in {file.opens}" if file.opens else ""])) + "."
+    first = "" if len(file.name) < _COLUMN - 1 else f"{file.name}\n"
+    head, indent = " " * _COLUMN if first else file.name.ljust(_COLUMN), " " * _COLUMN
+    return first + textwrap.fill(text, WIDTH, initial_indent=head, subsequent_indent=indent, break_on_hyphens=False)
+
+
+def licences(figures: Iterable[Mapping[str, Any]], metres: Metres | None) -> str:
+    """Name the networks that figures of stages and the metres rest on, with their licences; "" without any."""
+    said = " ".join(str(value) for of_stage in figures for value in of_stage.values())
+    named = set(re.findall(r"(?:onnx|tflite):([\w.-]+)", said))
+    named |= set(re.findall(r"network ([\w.-]+)", metres.text if metres else ""))
+    lines = [
+        f"  {m.name}: {m.licence}{'' if m.commercial else ' (ask before commercial use)'}"
+        for m in ModelStore.open().models
+        if m.name in named
+    ]
+    return "\n".join(["\nNetworks that these results were made with, and their licences:", *lines, ""]) if lines else ""
+
+
+def write_pieces(context: StageContext) -> None:
+    """Make the pieces, and write piece_2 and so on: each with all the files of an export, or with its poses."""
+    for piece in make_pieces(context):
+        if "export" in (records := load_records(piece)):
+            for name in records["export"].files:
+                copy_file(piece.file("export", name), context.folder / piece.root.name / name)
+        elif "tracking" in records:
+            scene = ExportScene(load_outcome(piece, context.device), FIRST, context)
+            target = Target(context.folder / piece.root.name)
+            write_colmap(scene, target)
+            write_trajectory(scene, target)
+
+
+def make_pieces(context: StageContext) -> list[RunFolder]:
+    """Bring the pieces that tracking has found up to date, largest first, and remove those it no longer finds; a piece
+    of which no map can be made is reported."""
+    run, names = context.run, context.run.pieces("tracking")
+    for old in run.root.glob("piece_[0-9]*"):
+        if old.name not in names and RunFolder(old).manifest_file.exists():
+            discard(old)
+    records, made = load_records(run), []
+    for name in names:
+        piece = run.piece(name)
+        piece.root.mkdir(exist_ok=True)
+        stages = [Stage("frames", take_frames), *context.stages[1:]]
+        try:
+            inside = WithinStage(context.progress, name)
+            run_stages(stages, piece, context.source, piece_digest(records, name), _settings(context.config), inside)
+        except RecoverableError:
+            raise
+        except InputError as error:
+            context.warn(f"{name} is posed, and could not be made whole: {error}")
+        made.append(piece)
+    return made
+
+
+def _settings(config: Config) -> Config:
+    """Those of the run around it; a length that is known in one image says nothing about another world."""
+    height = config.proxy.scale_ref.strip().startswith("height")
+    return config if height else replace(config, proxy=replace(config.proxy, scale_ref=""))
+
+
+def take_frames(context: StageContext) -> dict[str, Any]:
+    """The stage `frames` of a piece: its frames counted anew, and what the run around it knows of them."""
+    around, name = RunFolder(context.run.root.parent), context.run.root.name
+    posed = np.flatnonzero(around.load(TRAJECTORY, "tracking", piece=name).is_posed).tolist()
+    frames, number = around.load(FRAMES), {old: new for new, old in enumerate(posed)}
+    for frame in (frames[i] for i in posed):
+        copy_file(around.image_file(frame), context.folder / frame.name)
+        if (mask := around.find(LEFT_OUT, of=frame.name)) is not None:
+            LEFT_OUT.save(context.folder, mask, frame.name)
+    save_frames(context.folder, [replace(frames[old], id=new) for old, new in number.items()])
+    CALIBRATION.save(context.folder, around.load(CALIBRATION))
+    model = around.load(SPARSE, "tracking", piece=name)
+    BACKBONE.save(context.folder, replace(model, frame_ids=np.array([number[i] for i in model.frame_ids.tolist()])))
+    for old, new in number.items():
+        if (features := around.find(FEATURES, of=old)) is not None:
+            FEATURES.save(context.folder, features, of=new)
+    tried = {
+        (number[i], number[j]): n for (i, j), n in around.load(MATCHED_PAIRS).items() if i in number and j in number
+    }
+    VOCABULARY.save(context.folder, around.load(VOCABULARY))
+    MATCHED_PAIRS.save(context.folder, tried)
+    return {"frames": len(posed), "keyframes": len(model.frame_ids), "of_the_run": [posed[0], posed[-1]]}

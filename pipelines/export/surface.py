@@ -182,35 +182,16 @@ def _border(places: NDArray[np.int64], chunks: NDArray[np.int32]) -> NDArray[np.
 
 def _pieces(faces: NDArray[np.int32], count: int) -> NDArray[np.int32]:
     """(count,) numbers from 0 of the connected pieces, -1 for a vertex without a face."""
-    first = _firsts(faces, count)
-    has_face = np.zeros(count, bool)
-    has_face[faces.reshape(-1)] = True
-    number = np.full(count, -1, np.int32)
-    firsts = np.flatnonzero(has_face & (first == np.arange(count)))
-    number[firsts] = np.arange(len(firsts))
-    return np.where(has_face, number[first], np.int32(-1))
+    number, used = np.full(count, -1, np.int32), np.unique(faces)
+    joined = _components(np.concatenate([faces[:, :2], faces[:, 1:]]), count)[used]
+    number[used] = np.unique(joined, return_inverse=True)[1]
+    return number
 
 
-@kernel
-def _firsts(faces, count):  # type: ignore[no-untyped-def]
-    """(count,) the first vertex of the piece that each belongs to."""
-    first = np.arange(count).astype(np.int32)
-    for f in range(len(faces)):
-        for k in range(2):
-            a, b = faces[f, k], faces[f, k + 1]
-            while first[a] != a:
-                first[a] = first[first[a]]
-                a = first[a]
-            while first[b] != b:
-                first[b] = first[first[b]]
-                b = first[b]
-            if a < b:
-                first[b] = a
-            else:
-                first[a] = b
-    for v in range(count):  # none is before its first, so that that is known
-        first[v] = first[first[v]]
-    return first
+def _components(edges: NDArray[np.integer], count: int) -> NDArray[np.int32]:
+    """(count,) the number of the connected component of each node, by edges (E, 2)."""
+    graph = coo_array((np.ones(len(edges), bool), edges.T), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1])
 
 
 @dataclass(frozen=True)
@@ -286,10 +267,7 @@ def _choose(sizes: Sequence[_Sizes], least_share: float) -> list[_Chosen]:
     numbers = (np.where(s.border < 0, -1, s.border + a) for s, a in zip(sizes, starts, strict=False))
     piece = np.concatenate([np.zeros(0, int), *numbers])
     used = piece >= 0
-    graph = coo_array(
-        (np.ones(int(used.sum()), bool), (piece[used], place[used] + count)), shape=(count + len(places),) * 2
-    )
-    whole = connected_components(graph, directed=False)[1][:count]
+    whole = _components(np.stack([piece[used], place[used] + count], 1), count + len(places))[:count]
     faces = np.bincount(whole, np.concatenate([np.zeros(0), *(s.faces for s in sizes)]))
     stays = np.append(faces[whole] >= least_share * faces.max(initial=0), False)
     place_stays = np.zeros(len(places), bool)

@@ -113,10 +113,8 @@ def _density(vertices: NDArray[np.float32], normals: NDArray[np.float64], shot: 
     """(V,) pixels a unit of length along the foreshortened direction, 0 for vertices that the map hides."""
     view, pose = shot.depth_view, shot.depth_view.cam_from_world
     xy, z, inside = view.seen(vertices.astype(np.float64))
-    place = np.where(inside.reshape(-1, 1), xy, 0).astype(np.int64)
-    seen = (
-        inside & (view.trust[place[:, 1], place[:, 0]] > 0) & (view.depth[place[:, 1], place[:, 0]] > (1 - _HIDDEN) * z)
-    )
+    column, row = np.where(inside.reshape(-1, 1), xy, 0).astype(np.int64).T
+    seen = inside & (view.trust[row, column] > 0) & (view.depth[row, column] > (1 - _HIDDEN) * z)
     in_cam = vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
     towards = -(normals @ pose[:3, :3].T * in_cam).sum(1) / np.maximum(np.linalg.norm(in_cam, axis=1), 1e-9)
     return np.where(seen, (shot.camera.fx * towards / np.where(seen, z, 1)).clip(0), 0)
@@ -259,9 +257,7 @@ def _shots(outcome: Outcome, views: Sequence[PosedDepth]) -> Sequence[Shot]:
     # Blank walls count as blurred in themselves: neighbours, which see about the same, define what is sharp there.
     usual = median_filter(measured, size=7, mode="nearest")
     sharpness = np.sqrt(np.minimum(measured / np.maximum(usual, 1e-9), 1))
-    return LruSequence(
-        len(frames), lambda n: _shot(outcome, frames[n], views[n], float(sharpness[n])), lambda shot: 1, 1
-    )
+    return LruSequence(len(frames), lambda n: _shot(outcome, frames[n], views[n], float(sharpness[n])), lambda _: 1, 1)
 
 
 def _shot(outcome: Outcome, frame: Frame, view: PosedDepth, sharpness: float) -> Shot:
@@ -290,9 +286,8 @@ def simplified(mesh: MeshArrays, share: float = SHARE) -> MeshArrays:
             break
         wanted *= 0.99 * most / len(used)
     _, nearest = cKDTree(mesh.vertices).query(points[used])
-    return MeshArrays(
-        points[used], renumbered.reshape(-1, 3).astype(np.int32), mesh.colors[nearest], mesh.labels[nearest]
-    )
+    faces = renumbered.reshape(-1, 3).astype(np.int32)
+    return MeshArrays(points[used], faces, mesh.colors[nearest], mesh.labels[nearest])
 
 
 def unwrapped(mesh: MeshArrays, texels_per_unit: float, most: int) -> Atlas:

@@ -89,13 +89,9 @@ def pack_cloud(cloud: GaussianCloud, upright: NDArray[np.float64]) -> tuple[dict
     planes.append(np.full(len(cloud), VOID, np.uint8) if cloud.class_ids is None else cloud.class_ids)
     packed = gzip.compress(np.stack(planes).astype(np.uint8).tobytes(), compresslevel=9, mtime=0)
     about = {
-        "count": len(cloud),
-        "total": total,
-        "low": low.tolist(),
-        "high": high.tolist(),
-        "log_radii": [float(smallest), float(largest)],
-        "middle": np.median(means, axis=0).tolist(),
-    }
+        "count": len(cloud), "total": total, "low": low.tolist(), "high": high.tolist(),
+        "log_radii": [float(smallest), float(largest)], "middle": np.median(means, axis=0).tolist(),
+    }  # fmt: skip
     return about, packed
 
 
@@ -104,13 +100,8 @@ def _classes(cloud: GaussianCloud, outcome: Outcome) -> dict[str, Any]:
     if cloud.class_ids is None:
         return {"classes": []}
     shares = np.bincount(cloud.class_ids, minlength=256) / len(cloud)
-    table = zip(outcome.classes.names, outcome.classes.colors, strict=True)
-    return {
-        "classes": [
-            {"name": name, "color": list(color), "share": round(float(shares[k]), 5)}
-            for k, (name, color) in enumerate(table)
-        ]
-    }
+    table = zip(outcome.classes.names, outcome.classes.colors, shares.tolist(), strict=False)
+    return {"classes": [{"name": n, "color": list(color), "share": round(share, 5)} for n, color, share in table]}
 
 
 def _cameras(outcome: Outcome, upright: NDArray[np.float64]) -> dict[str, Any]:
@@ -139,10 +130,8 @@ def _cameras(outcome: Outcome, upright: NDArray[np.float64]) -> dict[str, Any]:
 
 
 def _unit(outcome: Outcome, world: World) -> dict[str, Any]:
-    metres = outcome.metres
-    metric = outcome.metric or world.earth is not None
-    unit: dict[str, Any] = {"metric": metric}
-    if metres is not None:
+    unit: dict[str, Any] = {"metric": outcome.metric or world.earth is not None}
+    if (metres := outcome.metres) is not None:
         text = f"{metres.text[0].upper()}{metres.text[1:]}."
         unit |= {"per_unit": metres.per_unit, "relative_sd": metres.relative_sd, "text": text}
     return {"unit": unit, "floor": world.has_floor}

@@ -21,10 +21,10 @@ from ..global_ba.close import Edges, optimise_pose_graph
 from ..mapping.views import View, half_view
 from ..proxy.maps import mean_iou
 from ..types import VOID, Intrinsics, LoopEdge
-from .constants import PAPER, Constants
 from .rendering import Gaussians
 from .rerender import Rerendering, Samples, sample
 from .tracking import overlap, track_pose
+from .uncertainty import PAPER, Constants
 
 Array = NDArray[np.float64]
 GRID = (40, 30)

@@ -15,9 +15,8 @@ from ..mapping.losses import size_loss
 from ..mapping.views import View
 from ..render.api import Rendering
 from ..types import VOID
-from .constants import PAPER, Constants
 from .rendering import Gaussians, semantic_image, show
-from .uncertainty import MirrorPlane, mirror_plane, symmetry_pull
+from .uncertainty import PAPER, Constants, MirrorPlane, mirror_plane, symmetry_pull
 
 RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2, "class_logits": 5e-2}
 """Of Adam; positions in radii of the Gaussian."""
@@ -34,23 +33,11 @@ def depth_prior(
     """Eq. (17): P(D_i | S_i = k) ∝ exp(-(D_i - μ_k)² / 2σ_k²): (H, W) the most probable depth.
 
     depth, u (H, W) and classes (H, W). μ_k and σ_k come from the reliable pixels of a connected region of one class, as
-    a plane, which keeps walls slanted; where U is low they are weighed with the proxy by their variances.
-    """
-    inverse, _ = with_region_prior(depth, u, channels, constants.tau_low)
-    return np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
-
-
-def with_region_prior(
-    depth: NDArray[np.float32], trust: NDArray[np.float32], channels: NDArray[np.uint8], low: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Inverse depth, 0 = unknown, and trust (H, W), in which pixels trusted up to `low` have the depth of their region.
-
-    A region is connected and of one class in channels (H, W); μ_k of eq. (17) is a plane in inverse depth over it, so
-    that slanted walls keep their slant.
+    a plane in inverse depth, which keeps walls slanted; where U is low they are weighed with the proxy by their
+    variances. 0 = unknown.
     """
     inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
-    out, out_trust = inverse.copy(), np.where(depth > 0, trust, 0).astype(np.float32)
-    trust = out_trust.copy()
+    out, trust = inverse.copy(), np.where(depth > 0, u, 0).astype(np.float32)
     for channel in np.unique(channels[channels != VOID]):
         mask = (channels == channel).astype(np.uint8)
         _, regions, boxes, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
@@ -58,7 +45,7 @@ def with_region_prior(
             left, top, width, height = boxes[region, : cv2.CC_STAT_AREA]
             rows, columns = np.nonzero(regions[top : top + height, left : left + width] == region)
             rows, columns = rows + top, columns + left
-            weak = trust[rows, columns] <= low
+            weak = trust[rows, columns] <= constants.tau_low
             reliable = ~weak & (inverse[rows, columns] > 0)
             if not weak.any() or reliable.sum() < _MIN_REGION:
                 continue
@@ -71,8 +58,7 @@ def with_region_prior(
             fused = (proxy_precision * seen + prior_precision * mean) / (proxy_precision + prior_precision)
             good = (mean > 0) & (spread < 0.1 * mean)
             out[rows[good], columns[good]] = fused[good]
-            out_trust[rows[good], columns[good]] = np.maximum(weight[good], low / 2)
-    return out, out_trust
+    return np.divide(1, out, out=np.zeros_like(out), where=out > 0)
 
 
 def _fit_plane(

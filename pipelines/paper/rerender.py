@@ -22,7 +22,7 @@ from ..geometry import se3
 from ..geometry.camera import project, unproject
 from ..mapping.views import View
 from ..types import VOID, Intrinsics
-from .constants import PAPER, Constants
+from .uncertainty import PAPER, Constants
 
 Array = NDArray[np.float64]
 CELL = 6

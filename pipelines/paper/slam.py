@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ..depth.fields import FINE, field_scales
 from ..geometry import se3
@@ -17,13 +17,12 @@ from ..geometry.camera import unproject_depth
 from ..mapping.move_map import follow_keyframes
 from ..mapping.views import View
 from ..render.api import Rendering
-from ..types import Intrinsics
+from ..types import Array, Intrinsics
 from .adjustment import adjust_frame, carry, local_adjustment
-from .constants import PAPER, Constants
 from .mapping import grow, optimise, prune
 from .rendering import Gaussians, scaled_depth, show
 from .tracking import overlap, predict, select_keyframes, semantic_keyframes, time_weights, track_pose
-from .uncertainty import semantic_agreement, semantic_factor, with_agreement
+from .uncertainty import PAPER, Constants, semantic_agreement, semantic_factor, with_agreement
 
 STEPS, FIRST_STEPS = 15, 60
 """Of mapping, after each keyframe and after the first."""
@@ -34,6 +33,7 @@ _GRID = (40, 30)
 _STRIDE = 8
 _COVERED = 0.1
 """A frame of which the map covers less is lost."""
+_KEPT = ("unit", "poses", "fields", "summaries", "lost")
 
 
 @dataclass
@@ -45,8 +45,8 @@ class Slam:
     seed: int
     unit: float = 1.0
     gaussians: Gaussians | None = None
-    poses: dict[int, Tensor] = field(default_factory=dict)
-    fields: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    poses: dict[int, Array] = field(default_factory=dict)
+    fields: dict[int, Array] = field(default_factory=dict)
     summaries: dict[int, tuple[NDArray[np.uint8], float]] = field(default_factory=dict)
     lost: dict[int, str] = field(default_factory=dict)
 
@@ -62,44 +62,47 @@ class Slam:
                 self._begin(view, constants)
                 self._optimise(view_of, FIRST_STEPS, [view.frame_id], constants)
             return
-        found = track_pose(self.gaussians, self._scaled(view), self._starts(), self.classes, self.unit, constants)
+        starts = [torch.from_numpy(pose) for pose in self._starts()]
+        found = track_pose(self.gaussians, self._scaled(view), starts, self.classes, self.unit, constants)
         if found.covered < _COVERED:
             self.lost[view.frame_id] = "the map covers too little of it"
             return
-        pose = self.poses[view.frame_id] = _rotated(found.cam_from_world)
+        pose = self.poses[view.frame_id] = _rotated(found.cam_from_world.numpy())
         if not (may_map and self._is_new(view, pose, constants)):
             self.poses[view.frame_id] = self._adjusted_frame(view, pose, view_of, constants)
             return
         with torch.no_grad():
-            shown = show(vars(self.gaussians.map.only(self.gaussians.in_view(pose, view.intrinsics))), pose, view)
+            at = torch.from_numpy(pose)
+            shown = show(vars(self.gaussians.map.only(self.gaussians.in_view(at, view.intrinsics))), at, view)
         view = self._agreeing(view, shown, constants)
         self.fields[view.frame_id] = fitted_field(view, shown.depth.numpy(), shown.silhouette.numpy() > constants.t_sil)
         self.summaries[view.frame_id] = _summary(view)
         self._adjust(view_of, view.intrinsics, constants)
         pose = self.poses[view.frame_id]
-        grow(self.gaussians, self._scaled(view), pose, self.classes, constants)
+        grow(self.gaussians, self._scaled(view), torch.from_numpy(pose), self.classes, constants)
         chosen = self._select(view, pose, constants)
         self._optimise(view_of, STEPS, chosen, constants)
         if len(self.fields) % PRUNE_EVERY == 0:
             prune(self.gaussians, self.unit)
 
-    def _adjusted_frame(self, view: View, pose: Tensor, view_of: Callable[[int], View], constants: Constants) -> Tensor:
+    def _adjusted_frame(self, view: View, pose: Array, view_of: Callable[[int], View], constants: Constants) -> Array:
         """(25) for a frame that is no keyframe and the last two that are, of which only the frame moves: a keyframe is
         adjusted in its window, and two others alone can lead it astray where they show little."""
         near = self.keyframes[-2:]
-        poses = np.stack([*(self.poses[i].numpy() for i in near), pose.numpy()])
+        poses = np.stack([*(self.poses[i] for i in near), pose])
         fields = np.stack([self.fields[i] for i in [*near, near[-1]]])
-        new = adjust_frame(view_of, [*near, view.frame_id], poses, fields, self.classes, self.unit, constants)
-        return _rotated(torch.from_numpy(new))
+        return _rotated(
+            adjust_frame(view_of, [*near, view.frame_id], poses, fields, self.classes, self.unit, constants)
+        )
 
     def _begin(self, view: View, constants: Constants) -> None:
         """First pose = identity; the scale is that of the proxy depth."""
         self.unit = float(view.depth[view.depth > 0].median())
-        self.poses[view.frame_id] = torch.eye(4, dtype=torch.float64)
+        self.poses[view.frame_id] = np.eye(4)
         self.fields[view.frame_id], self.summaries[view.frame_id] = np.zeros((FINE.rows, FINE.columns)), _summary(view)
-        self.gaussians = grow(None, view, self.poses[view.frame_id], self.classes, constants)
+        self.gaussians = grow(None, view, torch.eye(4, dtype=torch.float64), self.classes, constants)
 
-    def _starts(self) -> list[Tensor]:
+    def _starts(self) -> list[Array]:
         """By (15), and where the last frame was: of sudden turns that is nearer."""
         *before, last = list(self.poses.values())[-2:]
         return [predict(before[0], last), last] if before else [last]
@@ -109,16 +112,14 @@ class Slam:
         nodes = self.fields.get(view.frame_id, self.fields[self.keyframes[-1]])
         return scaled_depth(view, torch.from_numpy(field_scales(nodes, *view.depth.shape)))
 
-    def _is_new(self, view: View, pose: Tensor, constants: Constants) -> bool:
-        last = self.poses[self.keyframes[-1]].numpy()
-        has_depth = bool((view.depth > 0).any())
+    def _is_new(self, view: View, pose: Array, constants: Constants) -> bool:
+        last, has_depth = self.poses[self.keyframes[-1]], bool((view.depth > 0).any())
         return has_depth and overlap(self._points(view, pose), last, view.intrinsics) < constants.new_keyframe
 
-    def _points(self, view: View, pose: Tensor) -> NDArray[np.float64]:
+    def _points(self, view: View, pose: Array) -> Array:
         """(P, 3) some of a frame's back-projected pixels."""
         points = unproject_depth(self._scaled(view).depth.numpy(), view.intrinsics)[::_STRIDE, ::_STRIDE].reshape(-1, 3)
-        world_from_cam = se3.inverse(pose.numpy())
-        return points[points[:, 2] > 0] @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+        return se3.transform(se3.inverse(pose), points[points[:, 2] > 0])
 
     def _agreeing(self, view: View, shown: Rendering, constants: Constants) -> View:
         """U with θ^γ of (3), by how well the map shows the classes of the frame."""
@@ -130,11 +131,11 @@ class Slam:
         weighed = with_agreement(view.reliability.numpy().astype(np.float64), theta, constants)
         return replace(view, reliability=torch.from_numpy(np.round(weighed).astype(np.uint8)))
 
-    def _select(self, view: View, pose: Tensor, constants: Constants) -> list[int]:
+    def _select(self, view: View, pose: Array, constants: Constants) -> list[int]:
         """The frame itself, and at most 20 keyframes by (10) to (14)."""
         others = [k for k in self.keyframes if k != view.frame_id]
         points = self._points(view, pose)
-        overlaps = [overlap(points, self.poses[k].numpy(), view.intrinsics) for k in others]
+        overlaps = [overlap(points, self.poses[k], view.intrinsics) for k in others]
         differs = semantic_keyframes(self.summaries[view.frame_id][0], np.stack([self.summaries[k][0] for k in others]))
         ages = np.arange(len(others), 0, -1)
         weights = time_weights(ages, np.array([self.summaries[k][1] for k in others]), constants)
@@ -145,17 +146,17 @@ class Slam:
         """(25) over the last keyframes; the Gaussians and the frames between move with them."""
         assert self.gaussians is not None
         ids = self.keyframes[-WINDOW:]
-        poses, fields = np.stack([self.poses[i].numpy() for i in ids]), np.stack([self.fields[i] for i in ids])
+        poses, fields = np.stack([self.poses[i] for i in ids]), np.stack([self.fields[i] for i in ids])
         moves = np.arange(len(ids)) > 0
         bends = moves | (ids[0] == self.keyframes[0])  # the scale of a later one is that of the map before
         new, bent = local_adjustment(view_of, ids, poses, fields, moves, bends, self.classes, self.unit, constants)
         carry(self.gaussians, ids, poses, new, bent - fields, camera)
         frames = np.array([i for i in self.poses if i > ids[0] and i not in self.fields])
         if len(frames):
-            was = np.stack([self.poses[i].numpy() for i in frames.tolist()])
+            was = np.stack([self.poses[i] for i in frames.tolist()])
             followed = follow_keyframes(frames, was, np.array(ids), poses, new, np.ones(len(ids)))
-            self.poses.update(zip(frames.tolist(), torch.from_numpy(followed), strict=True))
-        self.poses.update(zip(ids, torch.from_numpy(new), strict=True))
+            self.poses.update(zip(frames.tolist(), followed, strict=True))
+        self.poses.update(zip(ids, new, strict=True))
         self.fields.update(zip(ids, bent, strict=True))
 
     def _optimise(self, view_of: Callable[[int], View], steps: int, chosen: list[int], constants: Constants) -> None:
@@ -164,36 +165,24 @@ class Slam:
         rng = np.random.default_rng([self.seed, chosen[0], 1])
         for number in range(steps):
             k = chosen[0] if number % 2 == 0 else chosen[int(rng.integers(len(chosen)))]
-            optimise(self.gaussians, self._scaled(view_of(k)), self.poses[k], self.classes, self.unit, 1.0, constants)
+            view, pose = self._scaled(view_of(k)), torch.from_numpy(self.poses[k])
+            optimise(self.gaussians, view, pose, self.classes, self.unit, 1.0, constants)
 
-    def to_tensors(self) -> dict[str, Tensor]:
-        """A flat table for a snapshot; `from_tensors` is the inverse."""
-        if self.gaussians is None:
-            return {}
-        numbers = {
-            "unit": torch.tensor(self.unit, dtype=torch.float64), "posed": torch.tensor(list(self.poses)),
-            "poses": torch.stack(list(self.poses.values())), "keyframes": torch.tensor(self.keyframes),
-            "fields": torch.from_numpy(np.stack(list(self.fields.values()))),
-            "labels": torch.from_numpy(np.stack([labels for labels, _ in self.summaries.values()])),
-            "trust": torch.tensor([trust for _, trust in self.summaries.values()], dtype=torch.float64),
-            "lost": torch.tensor(list(self.lost), dtype=torch.int64),
-        }  # fmt: skip
-        return {**self.gaussians.to_tensors(), **numbers}
+    def to_value(self) -> dict[str, Any]:
+        """All of it for a snapshot; `restore` is the inverse."""
+        held = {} if self.gaussians is None else self.gaussians.to_tensors()
+        return {"gaussians": {k: v.numpy() for k, v in held.items()}, **{name: getattr(self, name) for name in _KEPT}}
 
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take what `to_tensors` returned."""
-        self.gaussians, self.unit = Gaussians.from_tensors(tensors), float(tensors["unit"])
-        keyframes = tensors["keyframes"].tolist()
-        self.poses = dict(zip(tensors["posed"].tolist(), tensors["poses"], strict=True))
-        self.fields = dict(zip(keyframes, tensors["fields"].numpy(), strict=True))
-        summaries = zip(tensors["labels"].numpy(), tensors["trust"].tolist(), strict=True)
-        self.summaries = dict(zip(keyframes, summaries, strict=True))
-        self.lost = dict.fromkeys(tensors["lost"].tolist(), "the map covers too little of it")
+    def restore(self, value: dict[str, Any]) -> None:
+        """Take what `to_value` returned."""
+        self.gaussians = Gaussians.from_tensors({k: torch.from_numpy(v.copy()) for k, v in value["gaussians"].items()})
+        for name in _KEPT:
+            setattr(self, name, value[name])
 
 
-def _rotated(pose: Tensor) -> Tensor:
+def _rotated(pose: Array) -> Array:
     """The pose with a rotation again: by (15) each frame more than doubles what it is off."""
-    return torch.from_numpy(se3.exp(se3.log(pose.numpy())))
+    return np.asarray(se3.exp(se3.log(pose)))
 
 
 def _summary(view: View) -> tuple[NDArray[np.uint8], float]:
@@ -203,7 +192,7 @@ def _summary(view: View) -> tuple[NDArray[np.uint8], float]:
     return labels, float(view.trust.mean())
 
 
-def fitted_field(view: View, shown: NDArray[np.float32], solid: NDArray[np.bool_]) -> NDArray[np.float64]:
+def fitted_field(view: View, shown: NDArray[np.float32], solid: NDArray[np.bool_]) -> Array:
     """(rows, columns) the log scale field from a view's proxy depth to a shown one (H, W) where that is solid.
 
     Smooth, and as it is on the whole where the map shows nothing."""

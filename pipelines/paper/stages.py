@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ...formats.errors import InputError
 from ...formats.tensors import load_tensors, save_tensors
@@ -43,6 +42,7 @@ from ..run.stages import StageContext
 from ..system.machine import VIEWS_SHARE
 from ..system.parallel import LruSequence
 from ..system.progress import is_asked
+from ..system.values import load_value, save_value
 from ..system.wording import stretches
 from ..types import Frame, Intrinsics, LoopEdge, Trajectory
 from .adjustment import (
@@ -55,11 +55,10 @@ from .adjustment import (
     small_descriptors,
     summarise_labels,
 )
-from .constants import constants_of
 from .mapping import draw_together, optimise
 from .rendering import Gaussians, scaled_depth
 from .slam import Slam
-from .uncertainty import proxy_depth
+from .uncertainty import constants_of, proxy_depth
 
 WORKING_SIDE = 320
 """Pixels on the long side of the images that frames are tracked with and the map is grown from."""
@@ -75,18 +74,17 @@ MAP_PASSES, FINE_PASSES = 1, 12
 def track_by_map(context: StageContext) -> dict[str, Any]:
     """Poses of all frames, and the map that they were found with."""
     _warn(context)
-    recording, snapshot = FrameViews(context), context.snapshot / "slam.safetensors"
+    recording, snapshot = FrameViews(context), context.snapshot / "slam.npz"
     slam, done = Slam(len(recording.class_ids), context.config.run.seed), 0
     if snapshot.exists():
-        held = load_tensors(snapshot)
-        done = int(held["done"])
+        done, held = load_value(snapshot)
         slam.restore(held)
     constants, frames = constants_of(context.config), recording.frames
     for frame in context.progress.track(frames[done:], "tracking", len(frames) - done):
         slam.step(recording.views[frame.id], recording.views.__getitem__, frame.id not in recording.held, constants)
         done += 1
         if slam.gaussians is not None and (done % SNAPSHOT_EVERY == 0 or is_asked()):
-            save_tensors(snapshot, {**slam.to_tensors(), "done": torch.tensor(done)})
+            save_value(snapshot, (done, slam.to_value()))
     if slam.gaussians is None or len(slam.poses) < 2:
         raise InputError(
             f"{context.source}: none of {len(frames)} frames could be tracked by the map. --method paper needs a depth "
@@ -336,19 +334,16 @@ class FrameViews:
 
 
 def trajectory_of(
-    frames: Sequence[Frame], poses: Mapping[int, Tensor], keyframes: Sequence[int], lost: Mapping[int, str]
+    frames: Sequence[Frame], poses: Mapping[int, NDArray[np.float64]], keyframes: Sequence[int], lost: Mapping[int, str]
 ) -> Trajectory:
     """Collect the poses (4, 4) by frame id."""
-    known, keys = [f.id in poses for f in frames], set(keyframes)
+    keys = set(keyframes)
     return Trajectory(
         np.array([f.id for f in frames]),
         np.array([f.timestamp for f in frames]),
-        np.array([poses[f.id].numpy() if f.id in poses else np.eye(4) for f in frames]),
+        np.array([poses.get(f.id, np.eye(4)) for f in frames]),
         np.array([f.id in keys for f in frames]),
-        tuple(
-            "" if k else lost.get(f.id, "before the first frame with a depth")
-            for f, k in zip(frames, known, strict=True)
-        ),
+        tuple("" if f.id in poses else lost.get(f.id, "before the first frame with a depth") for f in frames),
     )
 
 

@@ -15,9 +15,9 @@ from ..mapping.views import View, half_view
 from ..proxy.maps import mean_iou
 from ..render.api import Rendering
 from ..types import VOID, Intrinsics
-from .constants import PAPER, Constants
 from .rendering import Gaussians, semantic_image, show
 from .rerender import CELL, SAME_SURFACE, SD_DEPTH, Rerendering, Samples, sample
+from .uncertainty import PAPER, Constants
 
 Array = NDArray[np.float64]
 
@@ -93,7 +93,7 @@ class Tracked:
     covered: float
 
 
-def predict(previous: Tensor, last: Tensor) -> Tensor:
+def predict(previous: Array, last: Array) -> Array:
     """Eq. (15): E_{t+1} = E_t (E_{t-1}⁻¹ E_t), constant velocity; poses (4, 4) cam_from_world."""
     return last @ (se3.inverse(previous) @ last)
 

@@ -6,6 +6,7 @@ The exported world is laid onto them: z is up already, so a turn about it, a sca
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -96,8 +97,8 @@ def georeference(centers: Array, places: Array, metric: bool) -> tuple[Similarit
     """(enu_from_world, how good it is) of camera centres (N, 3), z up, and their places (N, 3), NaN where unknown.
 
     Heading, scale and shift come from the horizontal coordinates alone: altitudes by GPS are two or three times worse.
-    A metric world keeps its scale. Places that fit no common motion are left out (RANSAC over pairs, Fischler and
-    Bolles 1981, then least squares on what agrees). Returns in words why there is none where that is so.
+    A metric world keeps its scale. Places that fit no common motion are left out. Returns in words why there is none
+    where that is so.
     """
     known = np.isfinite(places[:, :2]).all(axis=1)
     if known.sum() < _MIN_FIXES:
@@ -106,7 +107,7 @@ def georeference(centers: Array, places: Array, metric: bool) -> tuple[Similarit
     flat = np.column_stack([places[known, :2], np.zeros(int(known.sum()))])
     target = enu_from_geodetic(flat, rough)[:, :2] @ (1, 1j)
     source = centers[known][:, :2] @ (1, 1j)
-    inside = _agreeing(source, target, metric)
+    inside = _agreeing(source, target)
     turn, shift = _fit(source[inside], target[inside], metric)
     errors = target[inside] - (turn * source[inside] + shift)
     residual = float(np.sqrt((np.abs(errors) ** 2).sum() / max(2 * inside.sum() - 4, 1)))
@@ -128,28 +129,21 @@ def georeference(centers: Array, places: Array, metric: bool) -> tuple[Similarit
     return move, found
 
 
-def _agreeing(source: NDArray, target: NDArray, metric: bool) -> NDArray[np.bool_]:
-    """(N,) which places the best motion through any two of them explains, by the median of what it leaves."""
-    rng = np.random.default_rng(0)
-    best, kept = np.inf, np.ones(len(source), bool)
-    for _ in range(_TRIALS):
-        pair = rng.choice(len(source), 2, replace=False)
-        if abs(source[pair[0]] - source[pair[1]]) < 1e-9:
-            continue
-        turn, shift = _fit(source[pair], target[pair], metric)
-        off = np.abs(target - (turn * source + shift))
-        if (middle := float(np.median(off))) < best and abs(turn) > 1e-9:
-            best = middle
-            # The median of a plane's Rayleigh distances is 1.18 deviations; 3.5 deviations lose nothing that is true.
-            kept = off <= max(3.5 / 1.18 * middle, 1e-9)
+def _agreeing(source: NDArray, target: NDArray) -> NDArray[np.bool_]:
+    """(N,) which places one similarity explains: of all through two of them the one with the least median of squares
+    (Rousseeuw 1984); all where none is found."""
+    from_xy, to_xy = (np.stack([z.real, z.imag], 1) for z in (source, target - target.mean()))
+    inside = cv2.estimateAffinePartial2D(from_xy, to_xy, method=cv2.LMEDS, maxIters=_TRIALS, confidence=1 - 1e-9)[1]
+    kept = np.ones(len(source), bool) if inside is None else inside.ravel() > 0
     for _ in range(5):
-        turn, shift = _fit(source[kept], target[kept], metric)
+        turn, shift = _fit(source[kept], target[kept])
         off = np.abs(target - (turn * source + shift))
+        # The median of a plane's Rayleigh distances is 1.18 deviations; 3.5 deviations lose nothing that is true.
         kept = off <= max(3.5 / 1.18 * float(np.median(off)), 1e-9)
     return kept
 
 
-def _fit(source: NDArray, target: NDArray, metric: bool) -> tuple[complex, complex]:
+def _fit(source: NDArray, target: NDArray, metric: bool = False) -> tuple[complex, complex]:
     """target = turn * source + shift in the complex plane, least squares; |turn| = 1 for a metric world."""
     a, b = source - source.mean(), target - target.mean()
     turn = complex((a.conj() * b).sum() / max(float((np.abs(a) ** 2).sum()), 1e-18))

@@ -1,9 +1,8 @@
 """Metres per unit of a run from everything that is known of it, with an honest standard deviation."""
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,8 +16,16 @@ from ..run.files import CALIBRATION, CLASSES, DEPTH_FIELDS, FIGURES, FRAME_SCALE
 from ..run.folder import RunFolder
 from ..types import Array, Intrinsics, Metres, MetresSource, Trajectory
 from .evidence import CEILING_HEIGHT, OUTDOORS, THINGS, Combined, Evidence, Mode, combine, independence
-from .heights import camera_height, ceiling_height, sizes_of_things, usual_distance
-from .view import MIN_CONFIDENCE, Scene, SeenFrame, build_scene
+from .room import (
+    MIN_CONFIDENCE,
+    Scene,
+    SeenFrame,
+    build_scene,
+    camera_height,
+    ceiling_height,
+    sizes_of_things,
+    usual_distance,
+)
 
 _SENSOR_SD = 0.02
 """Depth cameras: 1 to 3 % at room distances after the factory's calibration (Khoshelham and Oude Elberink, Sensors
@@ -48,6 +55,15 @@ _OUTDOORS_SHARE = 0.2
 """Share of an image, in the middle of all, that shows sky or open ground; through windows it is less. A judgement, not
 fitted to recordings."""
 
+_OUTDOORS_WARNING = (
+    "the scene is outdoors by its labels (sky, grass, road), so its size in metres is not estimated: what the estimate "
+    "knows are rooms. Give --scale-ref, or a GPS track with --gps"
+)
+_ROOM_WARNING = (
+    "the scale assumes an indoor room (no label network, no ceiling in view); outdoors it may be off by a factor of "
+    "ten. Install a label network with `msgs-slam models pull`, or give the scale with --scale-ref or --gps"
+)
+
 
 @dataclass(frozen=True)
 class Seen:
@@ -60,6 +76,14 @@ class Seen:
     names: tuple[str, ...]
     is_named: bool
 
+    @property
+    def is_outdoors(self) -> bool:
+        """Whether sky and open ground fill much of the images, where a network named what they show."""
+        wanted = [i for i, name in enumerate(self.names) if name.lower() in OUTDOORS]
+        if not (self.is_named and wanted and self.frames):
+            return False
+        return float(np.median([np.isin(f.maps.labels, wanted).mean() for f in self.frames])) > _OUTDOORS_SHARE
+
 
 def find_metres(
     run: RunFolder, trajectory: Trajectory, guess: bool, card: Card | None, threads: int = 1, device: str = "cpu"
@@ -67,15 +91,9 @@ def find_metres(
     """Estimate the unit of the world of `trajectory` in metres, None where they are unknown, or could only be guessed
     although guesses are off; and a warning where there is evidence against them.
 
-    Args:
-        run: the run, with its proxy maps.
-        trajectory: poses in the world whose unit is asked for.
-        guess: whether what is usual in the world counts.
-        card: a network for metric depth, where there is one.
-        threads: of the network.
-        device: "cpu" or "cuda".
-
-    Raises InputError for a network that is not what its card says.
+    guess: whether what is usual in the world counts; card: a network for metric depth, where there is one, on so many
+    threads and "cpu" or "cuda". Raises InputError for a network that
+    is not what its card says.
     """
     given = known_evidence(run)
     seen = load_seen(run, trajectory) if guess else None
@@ -83,19 +101,13 @@ def find_metres(
     # What was measured needs no guesses beside it: they can only doubt it.
     pieces = given if any(p.kind == MEASURED for p in given) else [*given, *usual]
     warning = contradiction(given, usual)
-    if seen is not None and not given and is_outdoors(seen):
-        warning = (
-            "the scene is outdoors by its labels (sky, grass, road), so its size in metres is not estimated: what the "
-            "estimate knows are rooms. Give --scale-ref, or a GPS track with --gps"
-        )
     metres = describe(pieces) if pieces else None
-    if metres is not None and seen is not None and not given and not is_room(seen, usual):
-        metres = replace(metres, only_in_room=True)
-        warning = (
-            "the scale assumes an indoor room (no label network, no ceiling in view); outdoors it may be off by a "
-            "factor of ten. Install a label network with `msgs-slam models pull`, or give the scale with --scale-ref "
-            "or --gps"
-        )
+    if given or seen is None:
+        return metres, warning
+    if seen.is_outdoors:
+        return metres, _OUTDOORS_WARNING
+    if metres is not None and not is_room(seen, usual):
+        return replace(metres, only_in_room=True), _ROOM_WARNING
     return metres, warning
 
 
@@ -104,18 +116,10 @@ def is_room(seen: Seen, usual: Sequence[Evidence]) -> bool:
     return seen.is_named or any(p.kind == CEILING_HEIGHT for p in usual)
 
 
-def is_outdoors(seen: Seen) -> bool:
-    """Whether sky and open ground fill much of the images, where a network named what they show."""
-    wanted = [i for i, name in enumerate(seen.names) if name.lower() in OUTDOORS]
-    if not (seen.is_named and wanted and seen.frames):
-        return False
-    return float(np.median([np.isin(f.maps.labels, wanted).mean() for f in seen.frames])) > _OUTDOORS_SHARE
-
-
 def usual_evidence(seen: Seen, card: Card | None, threads: int = 1, device: str = "cpu") -> list[Evidence]:
     """Collect evidence of a network, the room and the things in it; none where no frame has reliable depth, nor
     outdoors, where neither the network nor what is usual in a room holds."""
-    if is_outdoors(seen):
+    if seen.is_outdoors:
         return []
     scene = build_scene(seen.frames, seen.camera, seen.names, seen.is_named) if seen.frames else None
     if scene is None:
@@ -151,13 +155,21 @@ def load_seen(run: RunFolder, trajectory: Trajectory) -> Seen:
 
 
 def known_evidence(run: RunFolder) -> list[Evidence]:
-    """Return evidence of whatever made the world metric; none where it is not."""
+    """Return evidence that the unit is a metre, from whatever made the world metric; none for a run without metres."""
+    report = run.load(FIGURES["proxy"])
+    if not report.get("metric"):
+        return []
+    if report.get("scale_from") == "reference":
+        sd = max(float(report["reference_relative_sd"]), _MIN_SD)
+        return [Evidence("the given reference", MEASURED, (Mode(0.0, sd),), 0.0, is_guess=False)]
     # How each frame's depth strays around its points, and how exactly tracking fitted metric depth, where it did.
     spreads = [row["spread"] for row in run.find(FRAME_SCALES) or ()]
-    tracked = run.find(FIGURES["tracking"])
-    statistical = 0.0 if tracked is None else float(tracked.get("scale_relative_sd") or 0.0)
-    proxy = run.load(FIGURES["proxy"])
-    return known_scale(proxy, spreads, statistical)
+    statistical = float((run.find(FIGURES["tracking"]) or {}).get("scale_relative_sd") or 0.0)
+    name = str(report.get("depth", "depth"))
+    is_sensor = name.startswith("files") and (not spreads or float(np.median(spreads)) < _SENSOR_SPREAD)
+    kind, wrong, own = (MEASURED, 0.0, _SENSOR_SD) if is_sensor else ("network", 0.03, LARGE_SD)
+    modes = (Mode(0.0, float(np.hypot(own, statistical))),)
+    return [Evidence(f"the depth of {name}", kind, modes, wrong, is_guess=False)]
 
 
 def describe(pieces: Sequence[Evidence]) -> Metres:
@@ -214,24 +226,15 @@ def network_scale(
     """Find the metres per unit that make the frames' depth what the network says, the median over frames; None where
     the network and the frames' reliable depth have too little in common.
 
-    Args:
-        card: a network for metric depth.
-        frames: the keyframes it looks at.
-        camera: intrinsics of their images.
-        threads: of the network.
-        device: "cpu" or "cuda".
-
-    Raises InputError for a network that is not what its card says.
+    camera: intrinsics of the frames' images. Raises InputError for a network that is not what its card says.
     """
     network = Network(card, threads, device)
     small = all(card.focal)
     logs = []
     for frame in frames:
-        zooms = (
-            [log_ratio(network, frame, camera, zoom) for zoom in _ZOOMS] if small else [_plain(network, frame, camera)]
-        )
-        known = [z for z in zooms if z is not None]
-        if known:
+        plain = () if small else (_plain(network, frame, camera),)
+        zoomed = (log_ratio(network, frame, camera, zoom) for zoom in _ZOOMS) if small else plain
+        if known := [found for found in zoomed if found is not None]:
             logs.append(float(np.mean(known)))
     if not logs:
         return None
@@ -257,9 +260,10 @@ def log_ratio(network: Network, frame: SeenFrame, camera: Intrinsics, zoom: floa
     output = network.run(image, Letterbox(columns, rows, columns, rows))["output"]
     metres = np.asarray(output, np.float64).reshape(rows, columns)
     low, high = network.card.valid
-    depth = retake_nearest(frame.maps.depth, camera, own)
-    sure = retake_nearest(frame.maps.confidence, camera, own) >= MIN_CONFIDENCE
-    return _median_log(np.where((metres > low) & (metres < high), metres * zoom, 0), np.where(sure, depth, 0))
+    rows, columns = frame.maps.depth.shape
+    depth = np.where(frame.maps.confidence >= MIN_CONFIDENCE, frame.maps.depth, 0)
+    depth = _warped(depth, camera.resized(columns, rows), own, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
+    return _median_log(np.where((metres > low) & (metres < high), metres * zoom, 0), depth)
 
 
 def _plain(network: Network, frame: SeenFrame, camera: Intrinsics) -> float | None:
@@ -281,38 +285,13 @@ def retake(image: NDArray[np.uint8], camera: Intrinsics, other: Intrinsics) -> N
     sx, sy = other.fx / camera.fx, other.fy / camera.fy
     if min(sx, sy) < 0.75:  # linear interpolation alone would alias
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigmaX=0.4 / sx, sigmaY=0.4 / sy), np.uint8)
+    return np.asarray(_warped(image, camera, other, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE), np.uint8)
+
+
+def _warped(image: NDArray, camera: Intrinsics, other: Intrinsics, how: int, border: int) -> NDArray:
+    sx, sy = other.fx / camera.fx, other.fy / camera.fy
     # OpenCV's pixel centres are at integers.
     shift_x = other.cx - 0.5 - sx * (camera.cx - 0.5)
     shift_y = other.cy - 0.5 - sy * (camera.cy - 0.5)
     matrix = np.array([[sx, 0, shift_x], [0, sy, shift_y]])
-    size = (other.width, other.height)
-    return np.asarray(cv2.warpAffine(image, matrix, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
-
-
-def retake_nearest(values: NDArray[np.float32], camera: Intrinsics, other: Intrinsics) -> Array:
-    """(height, width) of `other`: the values of an image of `camera`'s view at its pixels, 0 outside it."""
-    x = (np.arange(other.width) + 0.5 - other.cx) / other.fx * camera.fx + camera.cx
-    y = (np.arange(other.height) + 0.5 - other.cy) / other.fy * camera.fy + camera.cy
-    columns = np.floor(x * values.shape[1] / camera.width).astype(np.int64)
-    rows = np.floor(y * values.shape[0] / camera.height).astype(np.int64)
-    inside = ((rows >= 0) & (rows < values.shape[0]))[:, None] & ((columns >= 0) & (columns < values.shape[1]))[None]
-    taken = values[np.clip(rows, 0, values.shape[0] - 1)[:, None], np.clip(columns, 0, values.shape[1] - 1)[None]]
-    return np.where(inside, taken, 0).astype(np.float64)
-
-
-def known_scale(report: Mapping[str, Any], spreads: list[float], statistical_sd: float) -> list[Evidence]:
-    """Return evidence that the unit is a metre, from whatever made the world metric; none for a run without metres.
-
-    report: the proxy stage's; spreads: relative spread of each frame's depth around its triangulated points;
-    statistical_sd: relative deviation of the scale that tracking fitted to the depth.
-    """
-    if not report.get("metric"):
-        return []
-    if report.get("scale_from") == "reference":
-        sd = max(float(report["reference_relative_sd"]), _MIN_SD)
-        return [Evidence("the given reference", MEASURED, (Mode(0.0, sd),), 0.0, is_guess=False)]
-    name = str(report.get("depth", "depth"))
-    is_sensor = name.startswith("files") and (not spreads or float(np.median(spreads)) < _SENSOR_SPREAD)
-    sd = float(np.hypot(_SENSOR_SD if is_sensor else LARGE_SD, statistical_sd))
-    kind = MEASURED if is_sensor else "network"
-    return [Evidence(f"the depth of {name}", kind, (Mode(0.0, sd),), 0.0 if is_sensor else 0.03, is_guess=False)]
+    return np.asarray(cv2.warpAffine(image, matrix, (other.width, other.height), flags=how, borderMode=border))

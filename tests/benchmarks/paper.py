@@ -31,9 +31,8 @@ from msgs_slam.formats.textfile import read_json_object, write_json
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.paper import constants as paper_constants
-from msgs_slam.pipelines.paper import stages
-from msgs_slam.pipelines.paper.constants import PAPER, Constants
+from msgs_slam.pipelines.paper import stages, uncertainty
+from msgs_slam.pipelines.paper.uncertainty import PAPER, Constants
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import all_stages, reconstruct
 from msgs_slam.pipelines.run.folder import RunFolder, load_records
@@ -92,7 +91,7 @@ def measured(
     source: Path, run: RunFolder, config: Config, truth: Dataset, constants: Constants = PAPER
 ) -> dict[str, Any]:
     """Reconstruct with these constants of the paper, evaluate; what is done and unchanged is not done again."""
-    stages.constants_of = paper_constants.constants_of = lambda config: constants  # in every stage of this process
+    stages.constants_of = uncertainty.constants_of = lambda config: constants  # in every stage of this process
     reconstruct(source, run, config, SilentProgress(), until="global_ba")
     file = run.root.with_suffix(".json")
     stamp = {name: record.content for name, record in load_records(run).items()}

@@ -21,8 +21,7 @@ from msgs_slam.pipelines.evaluation.metrics import true_surface
 from msgs_slam.pipelines.evaluation.truth import absolute_error, match_truth
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.scene.upright import find_upright
-from msgs_slam.pipelines.scene.world import upright_world
+from msgs_slam.pipelines.scene.world import find_upright, upright_world
 
 
 def main() -> None:

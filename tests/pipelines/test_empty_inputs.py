@@ -27,8 +27,8 @@ from msgs_slam.pipelines.evaluation.truth import associate
 from msgs_slam.pipelines.evaluation.views import depth_picture, depth_range, view_map
 from msgs_slam.pipelines.export.colmap import seen_points
 from msgs_slam.pipelines.export.floor_plan import find_walls
+from msgs_slam.pipelines.export.mesh import find_planes
 from msgs_slam.pipelines.export.meshes import with_floor
-from msgs_slam.pipelines.export.planes import find_planes
 from msgs_slam.pipelines.export.surface import chunk_surfaces, joined, weld
 from msgs_slam.pipelines.export.texture import simplified, vertex_normals
 from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
@@ -43,12 +43,12 @@ from msgs_slam.pipelines.mapping.measure import depth_view, mesh_view
 from msgs_slam.pipelines.mapping.optimise import voted_logits
 from msgs_slam.pipelines.mapping.submaps import nearest_seeing
 from msgs_slam.pipelines.mapping.views import half_view, make_view, occurring_classes
-from msgs_slam.pipelines.paper.mapping import with_region_prior
+from msgs_slam.pipelines.paper.mapping import depth_prior
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.scene.gps import georeference
 from msgs_slam.pipelines.scene.metres import Seen, contradiction, usual_evidence
-from msgs_slam.pipelines.scene.upright import cameras_up, line_planes, up_of_lines
-from msgs_slam.pipelines.scene.view import SeenFrame, build_scene
+from msgs_slam.pipelines.scene.room import SeenFrame, build_scene
+from msgs_slam.pipelines.scene.world import cameras_up, line_planes, up_of_lines
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 
 UP = np.array([0.0, -1, 0])
@@ -167,12 +167,12 @@ def few_pixels() -> Iterator[Any]:
         photo, k = np.zeros((*size, 3), np.uint8), camera(*size)
         for depth in (full(size, 0), full(size, 2), full(size, np.nan)):
             yield lambda d=depth: depth_picture(d, *depth_range(d))
-            yield lambda v=PosedDepth(k, EYE, depth, depth): sees(v, v.in_world(*v.grid(320)[:2]))
+            yield lambda d=depth, k=k: sees(v := PosedDepth(k, EYE, d, d), v.in_world(*v.grid(320)[:2]))
             yield lambda d=depth: added(d, 0 * d)
             yield lambda d=depth: added(0 * d, d)
             yield lambda d=depth: (complete_depth(d, 0 * d), fill_smoothly(d, 0 * d))
             yield lambda d=depth, p=photo: seed_spacing(p, d, 2, 0.5, 0.5)
-            yield lambda d=depth, p=photo: with_region_prior(d, np.zeros_like(d), p[..., 0], 0.1)
+            yield lambda d=depth, p=photo: depth_prior(d, np.zeros_like(d), p[..., 0])
         for given in (maps(size, 0, 0), maps(size, np.nan, 1), maps(size, 2, 1), None):
             yield lambda g=given, k=k, p=photo: half_view(make_view(0, k, EYE, p, g, ()))
             if given is not None:

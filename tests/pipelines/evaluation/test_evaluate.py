@@ -15,11 +15,10 @@ from scipy.spatial.transform import Rotation
 from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.trajectory import write_tum
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome, refined_pose, trajectory_cells
 from msgs_slam.pipelines.evaluation.metrics import mesh_cells
 from msgs_slam.pipelines.evaluation.report import truth_section
-from msgs_slam.pipelines.evaluation.truth import match_truth, true_trajectory
+from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.evaluation.write import evaluation_rows, evaluation_table, write_evaluation
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import Similarity
@@ -164,24 +163,9 @@ def test_times_that_only_count_the_frames_match_nothing(
         evaluate_outcome(run, replace(truth, names=tuple("a" * n for n in range(1, 33))), max_views=1)
 
 
-def test_tum_lines_of_traj_txt_are_the_truth_between_the_images(
-    oracle_run: OracleRun, truth: Dataset, tmp_path: Path
-) -> None:
-    assert truth.timestamps is not None
-    assert truth.world_from_cam is not None
-    sparse = _untimed_copy(truth, tmp_path, {i: f"{i:06d}.png" for i in range(0, 32, 4)})
-    write_tum(tmp_path / "traj.txt", truth.timestamps, truth.world_from_cam)
-    (tmp_path / "timestamps.txt").write_text("".join(f"{t:.6f}\n" for t in truth.timestamps[::4]))
-    folder = open_sequence(sparse.root, "folder")
-    result = evaluate_outcome(load_outcome(oracle_run(video=True)), folder, max_views=1)
-    assert (result["frames"]["with true image"], result["frames"]["with true pose"]) == (8, 32)
-    assert result["trajectory"]["sim3 all"]["max"] < 1e-6
-
-
 def _untimed_copy(truth: Dataset, folder: Path, names: dict[int, str]) -> Dataset:
     """The images of `truth` under other names, with their poses in traj.txt."""
     folder.mkdir(exist_ok=True)
-    assert truth.world_from_cam is not None
     for index, name in names.items():
         write_rgb(folder / name if "." in name else folder / f"{name}.png", truth.rgb(index))
     write_matrices(folder / "traj.txt", truth.world_from_cam[list(names)])
@@ -191,7 +175,6 @@ def _untimed_copy(truth: Dataset, folder: Path, names: dict[int, str]) -> Datase
 
 
 def test_a_truth_of_free_unit_claims_no_metres(oracle_run: OracleRun, truth: Dataset) -> None:
-    assert truth.world_from_cam is not None
     poses = truth.world_from_cam.copy()
     poses[:, :3, 3] *= 0.13
     free = replace(truth, world_from_cam=poses, metric=False)
@@ -221,12 +204,6 @@ def test_every_image_of_the_source_is_judged_beside_the_picked_frames(oracle_run
     table = evaluation_table(result)
     assert "of the source's 32 images 32 are posed" in table
     assert "ATE SE(3), every image" in table
-
-
-def test_dense_poses_beside_sparse_images(truth: Dataset, shared_data: Path) -> None:
-    times, poses = true_trajectory(open_sequence(shared_data / "whiteroom"))
-    assert len(times) == len(poses) == 450
-    assert len(true_trajectory(truth)[0]) == 32
 
 
 def test_the_truth_of_another_recording_and_an_unfinished_run_are_refused(

@@ -38,10 +38,8 @@ def _exported(run: RunFolder, move: Similarity, floor: bool = True) -> RunFolder
 
 def test_lengths_of_the_made_up_room(oracle_run: OracleRun, truth: Dataset) -> None:
     outcome = load_outcome(oracle_run())
-    assert truth.world_from_cam is not None
     centers = truth.world_from_cam[:, :3, 3]
     length = path_length(outcome)
-    assert length is not None
     assert length[0] == pytest.approx(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum(), rel=1e-3)
     assert 0 < length[1] < 0.02
     assert measured_camera_height(outcome)[0] == pytest.approx(np.median(centers[:, 2]), abs=1e-3)
@@ -73,7 +71,6 @@ def test_they_are_said_as_the_tape_says_them(oracle_run: OracleRun) -> None:
     assert len(rows) == 5
     true = load_outcome(oracle_run())
     in_world = path_length(true)
-    assert in_world is not None
     assert rows["length of the path"] == length_text(*in_world, False, None)
     known = replace(outcome, metres=Metres(0.5, 0.1, True, ("a table",)))
     assert dict(found_lengths(known))["length of the path"].endswith(" m")

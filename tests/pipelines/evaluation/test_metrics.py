@@ -78,7 +78,6 @@ def test_scale_noise_and_holes_are_told_apart() -> None:
         depth[:, :40] = 0
         errors.add(depth, truth)
     result = errors.result()
-    assert result is not None
     assert result.scale == pytest.approx(1.25, rel=2e-3)
     assert result.metric_l1 == pytest.approx(0.2 * 3, rel=0.02)
     # The mean of |normal| is sqrt(2 / pi) standard deviations.
@@ -191,7 +190,6 @@ def cached(monkeypatch: pytest.MonkeyPatch, folder: Path, **contract: tuple[str,
 def test_by_the_file_in_the_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     path = cached(monkeypatch, tmp_path)
     measure = open_lpips()
-    assert not isinstance(measure, str)
     black, white = np.zeros((32, 48, 3), np.uint8), np.full((32, 48, 3), 255, np.uint8)
     assert measure(black, white) == pytest.approx(2)
     assert measure(white, white) == 0
@@ -214,17 +212,10 @@ def test_the_published_network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, 
         pytest.skip("lpips_alex.onnx is not in the shared models")
     monkeypatch.setattr(ModelStore, "open", lambda: store)
     measure = open_lpips()
-    assert not isinstance(measure, str)
     image = np.random.default_rng(0).integers(0, 256, (16, 16, 3), np.uint8).repeat(8, 0).repeat(8, 1)
     near = np.clip(image.astype(np.int64) + 2, 0, 255).astype(np.uint8)
     assert measure(image, image) == pytest.approx(0, abs=1e-6)
     assert 0 < measure(image, near) < 0.05 < measure(image, np.full_like(image, 128))
-
-
-def test_weights_are_not_downloaded(installed: Path) -> None:
-    assert "AlexNet's weights are not in" in str(open_lpips())
-    installed.write_bytes(b"")
-    assert not isinstance(open_lpips(), str)
 
 
 def test_a_cell_of_the_evaluation(

@@ -41,13 +41,11 @@ class Balanced(HTMLParser):
     def __init__(self) -> None:
         super().__init__()
         self.open: list[str] = []
-        self.images = 0
-        self.text = ""
+        self.images, self.text = 0, ""
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.images += tag == "img"
-        if tag not in VOID_TAGS:
-            self.open.append(tag)
+        self.open += [] if tag in VOID_TAGS else [tag]
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.images += tag == "img"
@@ -78,18 +76,12 @@ def test_report_is_whole_and_needs_nothing_from_outside(oracle_run: OracleRun, t
     parsed.feed(html)
     assert parsed.open == []
     assert parsed.images == 4 * 8 + 1
-    for heading in (
-        "What would improve it",
-        "What the map shows",
-        "What was found",
-        "Camera path",
-        "Compared with ground truth",
-        "Stages",
-        "Settings",
-    ):
-        assert heading in parsed.text
-    assert parsed.text.index("What the map shows") < parsed.text.index("What would improve it")
-    assert parsed.text.index("What would improve it") < parsed.text.index("What was found")
+    headings = (
+        "What the map shows", "What would improve it", "What was found", "Camera path", "Compared with ground truth",
+        "Stages", "Settings",
+    )  # fmt: skip
+    places = [parsed.text.index(heading) for heading in headings]
+    assert places == sorted(places)
     assert "depth, m: " in parsed.text
     assert "ATE Sim(3)" in parsed.text
     assert not re.search(r"\b(True|False|None)\b|[\[{]'", re.sub(r"<pre>.*?</pre>", "", html, flags=re.DOTALL))
@@ -210,15 +202,12 @@ def test_advice_says_what_is_wrong_and_nothing_else(oracle_run: OracleRun) -> No
     swinging = replace(fine, brightness=np.linspace(60, 180, 32))
     dark = replace(fine, brightness=np.full(32, 20.0))
     bare = replace(fine, points=np.full(32, 20))
-    for capture, words in (
-        (blurred, "8 of 32 frames are blurred"),
-        (swinging, "lock the exposure"),
-        (dark, "very dark"),
-        (bare, "bare walls"),
-    ):
-        lines = advice(outcome, capture, model, loop, 30.0)
-        assert len(lines) == 1
-        assert words in lines[0]
+    found = {
+        "8 of 32 frames are blurred": blurred, "lock the exposure": swinging, "very dark": dark, "bare walls": bare
+    }  # fmt: skip
+    for words, capture in found.items():
+        (line,) = advice(outcome, capture, model, loop, 30.0)
+        assert words in line
     assert "do not just turn" in advice(outcome, fine, ring_model(1.0, 500.0), loop, 30.0)[0]
     assert "16.0 dB" in advice(outcome, fine, model, loop, 16.0)[0]
     unsure_lens = replace(outcome, calibration=replace(outcome.calibration, origin="self-calibrated", focal_sd=20.0))
@@ -230,7 +219,6 @@ def test_plots_keep_to_their_frame_and_leave_gaps() -> None:
     svg = plot("a < b", "x", "y", [Line(points, "#000", "name")])
     assert "a &lt; b" in svg
     path = re.search(r'<path d="([^"]*)"', svg)
-    assert path is not None
     assert path[1].count("M") == 2
     places = np.array(re.findall(r"[ML]([\d.]+) ([\d.]+)", path[1]), float)
     assert len(places) == 3

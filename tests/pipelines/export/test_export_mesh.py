@@ -192,16 +192,6 @@ def test_threads_do_not_change_a_byte() -> None:
     assert one.weight.tobytes() == two.weight.tobytes()
 
 
-def test_nothing_seen_gives_an_empty_surface() -> None:
-    view = see_ball(0.0)
-    nothing = PosedDepth(CAMERA, view.cam_from_world, view.depth * 0, view.trust * 0)
-    grid = make_grid([nothing, nothing], VOXEL, 4.0, 1000)
-    assert list(grid.regions()) == []
-    assert len(fuse(grid, all_chunks(grid), [nothing]).blocks) == 0
-    assert len(whole([], 0.01).faces) == 0
-    assert len(whole([weld([], np.zeros((0, 3), np.int32), VOXEL)], 0.01).faces) == 0
-
-
 def test_small_pieces_go_and_are_counted_over_all_regions() -> None:
     """Strips of unit squares along x; the second chunk begins at 64."""
 

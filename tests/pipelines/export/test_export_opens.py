@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from msgs_slam.pipelines.config import ExportConfig
-from msgs_slam.pipelines.export.readme import WIDTH
-from msgs_slam.pipelines.export.stage import export_run
+from msgs_slam.pipelines.export.stage import WIDTH, export_run
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.outcome import Outcome, load_outcome

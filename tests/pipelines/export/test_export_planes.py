@@ -9,8 +9,17 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import ExportConfig
-from msgs_slam.pipelines.export.mesh import draw, keyframe_rows, mesh_views, planes_in, snap
-from msgs_slam.pipelines.export.planes import Planes, find_planes, planes_of, snap_to_planes
+from msgs_slam.pipelines.export.mesh import (
+    Planes,
+    draw,
+    find_planes,
+    keyframe_rows,
+    mesh_views,
+    planes_in,
+    planes_of,
+    snap,
+    snap_to_planes,
+)
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.geometry.voxels import Voxels
 from msgs_slam.pipelines.mapping.measure import MeshView
@@ -56,16 +65,6 @@ def test_an_unsure_wall_becomes_straight() -> None:
     before, after = (np.abs(v.shown.depth - truth)[MIDDLE] for v in (seen[0], snap_to_planes(seen[0], planes)))
     assert np.percentile(before, 90) > VOXEL
     assert np.percentile(after, 90) < 0.1 * VOXEL
-
-
-def test_sure_depths_stay() -> None:
-    seen = views(room() + 0.3 * VOXEL * WAVES, MIDDLE)
-    planes, first = planes_of(seen), seen[0]
-    changed = snap_to_planes(first, planes).shown.depth != first.shown.depth
-    assert changed[MIDDLE].mean() > 0.9
-    assert not changed[~MIDDLE].any()
-    sure = replace(first, unsure=np.zeros_like(MIDDLE))
-    np.testing.assert_array_equal(snap_to_planes(sure, planes).shown.depth, first.shown.depth)
 
 
 def test_a_step_of_four_voxels_stays() -> None:

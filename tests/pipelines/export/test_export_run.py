@@ -22,9 +22,8 @@ from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export import texture as textured
 from msgs_slam.pipelines.export.kinds import EXPORTS, Export, export_of, files_table, kinds_help
-from msgs_slam.pipelines.export.readme import licences
 from msgs_slam.pipelines.export.scene import ExportScene, find_world
-from msgs_slam.pipelines.export.stage import export_folder, export_run
+from msgs_slam.pipelines.export.stage import export_folder, export_run, licences
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.outcome import Outcome, load_outcome
@@ -147,15 +146,9 @@ def test_one_kind_of_mesh_and_colours_without_a_texture(run: RunFolder, tmp_path
 
 def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
     expected = {
-        "colmap": "transforms.json",
-        "ply": "point_cloud.ply",
-        "spz": "point_cloud.spz",
-        "sog": "point_cloud.sog",
-        "glb": "point_cloud.glb",
-        "html": "map.html",
-        "tiles": "tiles/tileset.json",
-        "tum": "trajectory.txt",
-    }
+        "colmap": "transforms.json", "ply": "point_cloud.ply", "spz": "point_cloud.spz", "sog": "point_cloud.sog",
+        "glb": "point_cloud.glb", "html": "map.html", "tiles": "tiles/tileset.json", "tum": "trajectory.txt",
+    }  # fmt: skip
     for only in [row.kind for row in EXPORTS if row.needs == "map" and row.kind != "mesh"]:
         export_run(run, tmp_path / only, only, settings=ExportConfig(axes="first"))
         assert (tmp_path / only / expected[only]).exists()

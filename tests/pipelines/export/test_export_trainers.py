@@ -111,11 +111,8 @@ def test_splats_and_what_they_are_trained_on_stand_in_one_world_with_y_down(
     vertex = plyfile.PlyData.read(str(tmp_path / "point_cloud.ply"))["vertex"]
     x, y, z = outcome.require_map().means.numpy().T
     np.testing.assert_allclose(np.stack([vertex[n] for n in "xyz"]), [x, -z, y], atol=1e-5)
-    assert json.loads((tmp_path / "world.json").read_text())["splats_from_exported"] == [
-        [1, 0, 0],
-        [0, 0, -1],
-        [0, 1, 0],
-    ]
+    turned = json.loads((tmp_path / "world.json").read_text())["splats_from_exported"]
+    assert turned == [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
     x, y, z = outcome.trajectory.centers.T
     model = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
     centers = {image.name: image.projection_center() for image in model.images.values()}

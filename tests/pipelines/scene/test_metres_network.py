@@ -11,7 +11,7 @@ from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.networks.card import Card
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.scene.metres import SMALL_SD, network_scale, retake
-from msgs_slam.pipelines.scene.view import SeenFrame
+from msgs_slam.pipelines.scene.room import SeenFrame
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 from tests.networks import save_network
 
@@ -46,7 +46,6 @@ def painted(unit: float, confidence: float = 1.0) -> SeenFrame:
 def test_a_network_is_asked_as_its_training_camera_would_have_seen(tmp_path: Path, unit: float) -> None:
     """It is asked at focal lengths of 1, 1.25 and 1.5 times its own; what those show looks nearer by as much."""
     found = network_scale(stand_in(tmp_path / "n.onnx"), [painted(unit)] * 3, CAMERA, 1, "cpu")
-    assert found is not None
     assert found.log_scale == pytest.approx(np.log(unit) + np.mean(np.log([1, 1.25, 1.5])), abs=0.02)
     assert SMALL_SD <= found.sd < SMALL_SD + 0.01
 
@@ -55,8 +54,6 @@ def test_a_narrow_lens_is_enlarged_and_its_depth_counts_more(tmp_path: Path) -> 
     narrow = replace(CAMERA, fx=400.0, fy=400.0)
     card = stand_in(tmp_path / "n.onnx")
     wide, tele = (network_scale(card, [painted(1.0)], camera, 1, "cpu") for camera in (CAMERA, narrow))
-    assert wide is not None
-    assert tele is not None
     # 64 pixels at 60 see 56 degrees; at 400 pixels of focal length the picture's 200 see 28: 1.875 times less.
     assert tele.log_scale - wide.log_scale == pytest.approx(np.log(400 / 200 * 64 / 60), abs=0.03)
 
@@ -85,13 +82,11 @@ def test_the_real_network_tells_the_metres_of_a_real_kitchen(shared_data: Path, 
     for i in (0, 100, 200, 298):
         image = read_rgb(shared_data / "kitchen" / f"frame-{i:06d}.color.jpg")
         depth = cv2.imread(str(shared_data / "kitchen" / f"frame-{i:06d}.depth.png"), cv2.IMREAD_UNCHANGED)
-        assert depth is not None
         metres = np.where(depth == 65535, 0, depth).astype(np.float32) / 1000
         maps = ProxyMaps(metres / 0.3, np.ones_like(metres), np.zeros(metres.shape, np.uint8), np.ones_like(metres))
         frames.append(SeenFrame(image, maps, np.eye(4)))
     card = store.card(store.get("fast-depth"))
     found = network_scale(card, frames, camera, 1, "cpu")
-    assert found is not None
     assert 0 < abs(found.log_scale - np.log(0.3)) < 2 * found.sd
     assert 0.25 <= found.sd < 0.4
     assert found.source == "the network fast-depth"

@@ -1,14 +1,31 @@
-"""Heights in a room: the camera and the ceiling over the floor, tables, seats and beds over it, and doors."""
+"""The room that the keyframes saw, as voxels with classes, and heights in it that tell how long a metre is: the camera
+and the ceiling over the floor, tables, seats and beds over it, and doors."""
 
+import sys
 from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label as connected
 
-from ..geometry.room_layout import FLOOR, levels
+from ..geometry.camera import resize_maps, unproject_depth
+from ..geometry.room_layout import (
+    CEILING,
+    FLOOR,
+    FloorPlane,
+    Gravity,
+    find_gravity,
+    floor_plane,
+    levels,
+    name_structure,
+)
 from ..geometry.room_layout import SURFACE as UNNAMED
+from ..geometry.voxels import MIN_WEIGHT, VOXELS_PER_DEPTH, Voxels, find, gather_frame, merge, voxel_keys
 from ..labels.named import disputed
+from ..providers import resize_area
+from ..types import VOID, Array, Intrinsics, ProxyMaps
 from .evidence import (
     CAMERA_OVER_FLOOR,
     CAMERA_OVER_TABLE,
@@ -26,7 +43,104 @@ from .evidence import (
     Sizes,
     measured,
 )
-from .view import Scene
+
+MIN_CONFIDENCE = 0.3
+_SIDE = 200
+_MIN_PLANE = 30
+"""Voxels without which a floor or a ceiling is none."""
+
+
+@dataclass(frozen=True)
+class SeenFrame:
+    """One keyframe: its image (H, W, 3), its maps with depth in the unit of the world, world_from_cam (4, 4)."""
+
+    image: NDArray[np.uint8]
+    maps: ProxyMaps
+    world_from_cam: Array
+
+
+@dataclass(frozen=True)
+class Scene:
+    """kind (V,): floor, ceiling, … by `name_structure`; label (V,) class of each voxel or VOID; names of the classes;
+    centres (N, 3) of the cameras; median_depth of what they see. `is_named`: whether something that knows things gave
+    the names, and not the geometry."""
+
+    voxels: Voxels
+    gravity: Gravity
+    kind: NDArray[np.int64]
+    label: NDArray[np.uint8]
+    names: tuple[str, ...]
+    centres: Array
+    median_depth: float
+    is_named: bool = True
+
+    def named(self, names: Sequence[str]) -> NDArray[np.bool_]:
+        """(V,) voxels whose class has one of these names."""
+        wanted = [i for i, name in enumerate(self.names) if name.lower() in names]
+        return np.isin(self.label, wanted)
+
+    def plane(self, kind: int) -> FloorPlane | None:
+        """Fit the plane of the floor or the ceiling; None where too little of it was seen."""
+        if (self.kind == kind).sum() < _MIN_PLANE:
+            return None
+        return floor_plane(self.voxels, self.kind, self.gravity.up, kind)
+
+    @property
+    def floor(self) -> FloorPlane | None:
+        return self.plane(FLOOR)
+
+    @property
+    def ceiling(self) -> FloorPlane | None:
+        return self.plane(CEILING)
+
+
+def build_scene(
+    frames: Sequence[SeenFrame], intrinsics: Intrinsics, names: tuple[str, ...], is_named: bool
+) -> Scene | None:
+    """The scene of some keyframes; None where none of them has reliable depth."""
+    known = [f.maps.depth[(f.maps.depth > 0) & (f.maps.confidence >= MIN_CONFIDENCE)][::7] for f in frames]
+    if not sum(map(len, known)):
+        return None
+    median_depth = float(np.median(np.concatenate(known)))
+    size = median_depth / VOXELS_PER_DEPTH
+    camera = intrinsics.at_most(_SIDE)
+    rows = [_gather(f, camera, size) for f in frames]
+    # Votes are by the same cubes, however many.
+    voxels = merge(size, [(keys, values) for keys, values, _ in rows], sys.maxsize, MIN_WEIGHT)
+    cameras = np.array([f.world_from_cam for f in frames])
+    gravity = find_gravity(voxels, -cameras[:, :3, 1].mean(0))
+    kind = name_structure(voxels, gravity, cameras[:, :3, 3])
+    label = _vote(voxels, [votes for _, _, votes in rows])
+    return Scene(voxels, gravity, kind, label, names, cameras[:, :3, 3], median_depth, is_named)
+
+
+def _gather(
+    frame: SeenFrame, camera: Intrinsics, size: float
+) -> tuple[NDArray[np.int64], Array, tuple[NDArray[np.int64], NDArray[np.uint8]]]:
+    """The frame's voxels as `gather_frame` gives them, and (Q,) key and label of each of its reliable pixels."""
+    maps, motion = resize_maps(frame.maps, camera.height, camera.width), frame.world_from_cam
+    sure = maps.confidence >= MIN_CONFIDENCE
+    weight = np.where(sure, maps.confidence, 0).astype(np.float32)
+    image = resize_area(frame.image, camera.width, camera.height)
+    keys, values = gather_frame(maps.depth, weight, image, camera, motion, size)
+    use = sure & (maps.depth > 0) & (maps.labels != VOID)
+    points = unproject_depth(maps.depth, camera)[use] @ motion[:3, :3].T + motion[:3, 3]
+    return keys, values, (voxel_keys(points, size), maps.labels[use])
+
+
+def _vote(voxels: Voxels, votes: Sequence[tuple[NDArray[np.int64], NDArray[np.uint8]]]) -> NDArray[np.uint8]:
+    """(V,) the label that most pixels of each voxel have; VOID for a voxel without any."""
+    label = np.full(len(voxels), VOID, np.uint8)
+    if not len(voxels) or not votes:
+        return label
+    at = find(voxels.keys, np.concatenate([keys for keys, _ in votes]))
+    given = np.concatenate([labels for _, labels in votes])
+    said, counts = np.unique(at[at >= 0] * 256 + given[at >= 0], return_counts=True)
+    # The most last, of as many the first label.
+    order = np.lexsort((-said, counts))
+    label[said[order] // 256] = said[order] % 256
+    return label
+
 
 _UPRIGHT = np.sin(np.radians(20))
 _CELL = 3.0
@@ -43,17 +157,12 @@ _WRONG_NAME, _WRONG_SURFACE = 0.3, 0.4
 """Chance that a thing is none, or that its level is another part of it. The small network of the default pull
 reaches a mean IoU of 55 % on ADE20K's validation images (MLPerf Mobile)."""
 
-Array = NDArray[np.float64]
-
 _NO_FLOOR, _UNNAMED_FLOOR = 0.03, 0.15
 """The chance that a plane is no floor: where a network calls it one, and where nothing names it."""
 _MOSTLY = 0.5
 _RISE = 0.6
 """A camera whose height changes by more than this part of itself (80 % of the views) does not stay on one floor."""
 _LEVEL = np.cos(np.radians(25))
-_GROUND_REACH, _GROUND_SD, _MIN_UNDER, _MIN_OVER_GROUND = 0.3, 0.15, 20, 0.3
-"""Ground is within this part of the usual depth around the camera; the height over it is so exact; so many voxels,
-and so large a share of the cameras with some under them, are needed."""
 _MIN_HEIGHT = 0.05
 """A camera nearer to its floor than this part of the usual depth was put on it: its height says nothing."""
 
@@ -70,19 +179,14 @@ def floor_trust(scene: Scene) -> float | None:
 
 
 def camera_height(scene: Scene) -> list[Evidence]:
-    """The camera over the floor, or on stairs over the ground: how people hold one; nothing without a floor."""
+    """The camera over the floor: how people hold one; nothing without a floor, or on stairs."""
     wrong, heights = floor_trust(scene), over_floor(scene)
-    if wrong is None or len(heights) == 0:
+    if wrong is None or len(heights) == 0 or not stays_on_floor(heights):
         return []
-    length_sd = 0.02
-    if not stays_on_floor(heights):
-        heights, length_sd = over_ground(scene), _GROUND_SD
-        if len(heights) < _MIN_OVER_GROUND * len(scene.centres):
-            return []
     height = float(np.median(heights))
     if height < _MIN_HEIGHT * scene.median_depth:
         return []
-    held = measured("floor height", "camera height", height, CAMERA_OVER_FLOOR, length_sd=length_sd)
+    held = measured("floor height", "camera height", height, CAMERA_OVER_FLOOR, length_sd=0.02)
     table_metres, table_sd = CAMERA_OVER_TABLE
     modes = [Mode(m.log_scale, m.sd, m.weight * (1 - wrong)) for m in held.modes]
     modes.append(Mode(float(np.log(table_metres / height)), table_sd, wrong))
@@ -102,22 +206,6 @@ def stays_on_floor(heights: Array) -> bool:
     return bool(middle > 0 and high - low < _RISE * middle)
 
 
-def over_ground(scene: Scene) -> Array:
-    """(K,) heights of cameras over level ground under them: the way that they went, seen from before or behind."""
-    up = scene.gravity.up
-    level = scene.voxels.normal @ up > _LEVEL
-    ground, reach = scene.voxels.position[level], _GROUND_REACH * scene.median_depth
-    heights = []
-    for centre in scene.centres:
-        from_camera = ground - centre
-        depth = -(from_camera @ up)
-        sideways = np.linalg.norm(from_camera + depth[:, None] * up, axis=1)
-        under = depth[(sideways < reach) & (depth > 0)]
-        if len(under) >= _MIN_UNDER:
-            heights.append(float(np.quantile(under, 0.6)))
-    return np.array(heights)
-
-
 def ceiling_height(scene: Scene) -> list[Evidence]:
     """The ceiling over the floor; nothing unless both are seen."""
     floor, ceiling, wrong = scene.floor, scene.ceiling, floor_trust(scene)
@@ -126,9 +214,8 @@ def ceiling_height(scene: Scene) -> list[Evidence]:
     height = float((ceiling.point - floor.point) @ floor.normal)
     if height <= 0:
         return []
-    return [
-        measured("ceiling height", CEILING_HEIGHT, height, CEILING_OVER_FLOOR, wrong=max(wrong, 0.1), length_sd=0.02)
-    ]
+    wrong = max(wrong, 0.1)
+    return [measured("ceiling height", CEILING_HEIGHT, height, CEILING_OVER_FLOOR, wrong=wrong, length_sd=0.02)]
 
 
 def usual_distance(scene: Scene) -> Evidence:
