@@ -1,7 +1,8 @@
 """Facts about the capture, frame by frame, lengths measured in it, and advice for the next one, in plain words."""
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import groupby
 
 import cv2
 import numpy as np
@@ -43,31 +44,16 @@ def read_capture(outcome: Outcome, sparse: SparseModel | None) -> Capture:
     return Capture(sharpness / max(float(np.median(sharpness)), 1e-9), brightness, points)
 
 
-@dataclass(frozen=True)
-class Stretch:
-    """Consecutive frames that are lost for one reason, or in one other piece; seconds in the source."""
-
-    first: int
-    last: int
-    start: float
-    end: float
-    reason: str
-
-
-def lost_stretches(outcome: Outcome) -> list[Stretch]:
-    """Lost frames, neighbours with the same reason together, whatever its counts of points are."""
+def lost_stretches(outcome: Outcome) -> list[str]:
+    """Describe lost frames, neighbours with the same reason together, whatever its counts of points are."""
     t = outcome.trajectory
-    stretches: list[Stretch] = []
-    for row, reason in enumerate(t.lost_reasons):
-        if not reason:
-            continue
-        frame, time = int(t.frame_ids[row]), float(t.timestamps[row])
-        previous = stretches[-1] if stretches else None
-        if previous and previous.last == frame - 1 and _kind(previous.reason) == _kind(reason):
-            stretches[-1] = replace(previous, last=frame, end=time)
-        else:
-            stretches.append(Stretch(frame, frame, time, time, reason))
-    return stretches
+    lost = [row for row in zip(t.frame_ids.tolist(), t.timestamps.tolist(), t.lost_reasons, strict=True) if row[2]]
+    lines = []
+    for _, group in groupby(enumerate(lost), lambda item: (item[1][0] - item[0], _kind(item[1][2]))):
+        frames = [frame for _, frame in group]
+        (first, start, reason), (last, end, _) = frames[0], frames[-1]
+        lines.append(f"frames {first}–{last} ({start:.2f}–{end:.2f} s): {reason}")
+    return lines
 
 
 def _kind(reason: str) -> str:

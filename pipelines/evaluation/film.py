@@ -203,8 +203,7 @@ def orbit(world_from_cam: Array, scene_depth: float, count: int, up: Array) -> A
     unit vector in the world.
     """
     focus, radius, height = _focus(world_from_cam, up, scene_depth)
-    first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    first /= np.linalg.norm(first)
+    first = np.linalg.svd(up[None])[2][1]
     second = np.cross(up, first)
     away = world_from_cam[:, :3, 3] - focus
     start, arc = _arc(np.arctan2(away @ second, away @ first))

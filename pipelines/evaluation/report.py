@@ -166,7 +166,7 @@ def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Loo
     if "global_ba" in outcome.records:
         text = ", ".join(f"{e.frame1_id}–{e.frame2_id} ({e.inliers} matches)" for e in loops[:12])
         rows.append(("loops", f"{len(loops)}: {text}" if loops else "none"))
-    lost = [f"frames {s.first}–{s.last} ({s.start:.2f}–{s.end:.2f} s): {s.reason}" for s in lost_stretches(outcome)]
+    lost = lost_stretches(outcome)
     rows.append(("frames without a pose", f"{len(lost)} stretches, below" if lost else f"none of {len(t.frame_ids)}"))
     extra = f"<h3>Frames without a pose</h3>{bullets(lost)}" if lost else ""
     if share := outcome.records["frames"].figures.get("still_left_out"):

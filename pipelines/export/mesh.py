@@ -123,14 +123,9 @@ def keyframe_rows(outcome: Outcome) -> list[int]:
 
 
 def draw_keyframes(task: Chunk, progress: Progress) -> None:
-    """Render the map in the keyframes of a chunk."""
-    context = task.context(progress)
-    outcome = load_outcome(task.run, context.device).moved(task.known["move"])
-    draw(outcome, task.config.export, _scratch(context), progress, task.numbers)
-
-
-def draw(outcome: Outcome, settings: ExportConfig, scratch: Path, progress: Progress, numbers: range) -> None:
-    """Render the map in the `keyframe_rows` with these numbers into `scratch`; existing files are kept."""
+    """Render the map in the keyframes of a chunk into the scratch folder; existing files are kept."""
+    context, settings = task.context(progress), task.config.export
+    outcome, scratch = load_outcome(task.run, context.device).moved(task.known["move"]), _scratch(context)
     rows, t, near = keyframe_rows(outcome), outcome.trajectory, maps_around(outcome)
     camera = outcome.calibration.intrinsics.at_most(outcome.config.mapping.max_side)
 
@@ -143,26 +138,22 @@ def draw(outcome: Outcome, settings: ExportConfig, scratch: Path, progress: Prog
                 view = replace(view, unsure=resample_nearest(maps.confidence, camera.height, camera.width) < SURE)
             save_value(file, view)
 
-    done = map_lookahead(draw_one, numbers, host_threads(outcome.require_map().means))
-    for _ in progress.track(done, "drawing", len(numbers)):
+    done = map_lookahead(draw_one, task.numbers, host_threads(outcome.require_map().means))
+    for _ in progress.track(done, "drawing", len(task.numbers)):
         pass
 
 
 def snap_views(task: Chunk, progress: Progress) -> None:
-    """Move uncertain depths of a chunk's views onto the planes of all."""
-    snap(_scratch(task.context(progress)), task.known["planes"], progress, task.numbers)
-
-
-def snap(scratch: Path, planes: Planes, progress: Progress, numbers: range) -> None:
-    """Move uncertain depths of the views of `draw` onto the planes; a view that is done stays."""
+    """Move uncertain depths of a chunk's views onto the planes of all; a view that is done stays."""
+    scratch = _scratch(task.context(progress))
 
     def snap_one(number: int) -> None:
         view: MeshView = load_value(file := _view_file(scratch, number))
         if view.unsure is not None:
-            save_value(file, snap_to_planes(view, planes))
+            save_value(file, snap_to_planes(view, task.known["planes"]))
 
-    done = map_lookahead(snap_one, numbers, get_threads())
-    for _ in progress.track(done, "straightening", len(numbers)):
+    done = map_lookahead(snap_one, task.numbers, get_threads())
+    for _ in progress.track(done, "straightening", len(task.numbers)):
         pass
 
 

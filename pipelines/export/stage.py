@@ -43,7 +43,7 @@ from ..run.manifest import piece_digest
 from ..run.runner import run_stages
 from ..run.stages import Stage, StageContext
 from ..run.target import Target, read_list
-from ..scene.world import FIRST, WORLD, World, in_world, world_figures
+from ..scene.world import FIRST, WORLD, in_world, world_figures
 from ..source.recording import is_of_source
 from ..system.machine import release_free_memory
 from ..system.progress import Progress, SilentProgress, WithinStage
@@ -228,14 +228,7 @@ def _origin(scene: ExportScene) -> str:
 
 def write_readme(scene: ExportScene, target: Target, files: Iterable[str]) -> None:
     """Write README.txt about those of the files, by their relative paths."""
-    outcome = scene.outcome
-    text = readme(scene.world, outcome.metres, outcome.metric, files)
-    used = licences([record.figures for record in outcome.records.values()], outcome.metres)
-    write_text(target.path(README), text + used)
-
-
-def readme(world: World, metres: Metres | None, metric: bool, files: Iterable[str] = ()) -> str:
-    """Return the text of README.txt for files in that world, by their relative paths."""
+    outcome, world = scene.outcome, scene.world
     if world.axes == "up":
         height = "the floor is at z = 0" if world.has_floor else "no floor was found, so z counts from that path too"
         heading = "x is east and y north (GPS, see world.json)" if world.earth else _OWN_HEADING
@@ -245,9 +238,11 @@ def readme(world: World, metres: Metres | None, metric: bool, files: Iterable[st
     tops = {PIECES if name.startswith(PIECES) else name.partition("/")[0] for name in files}
     known = [*(file for export in EXPORTS for file in export.files), *NOTES]
     entries = [_entry(file) for file in known if not tops.isdisjoint(file.tops)]
-    lines = [" ".join(axes.split()), *lengths(metres, metric).splitlines()]
+    lines = [" ".join(axes.split()), *lengths(outcome.metres, outcome.metric).splitlines()]
     about = [textwrap.fill(line, WIDTH, break_on_hyphens=False) for line in lines]
-    return "\n".join(["What is in this folder", "", *entries, "", _MORE, "", *about]) + "\n"
+    used = licences([record.figures for record in outcome.records.values()], outcome.metres)
+    text = "\n".join(["What is in this folder", "", *entries, "", _MORE, "", *about])
+    write_text(target.path(README), f"{text}\n{used}")
 
 
 def _entry(file: ExportedFile) -> str:

@@ -26,23 +26,8 @@ from ..geometry.voxels import MIN_WEIGHT, VOXELS_PER_DEPTH, Voxels, find, gather
 from ..labels.named import disputed
 from ..providers import resize_area
 from ..types import VOID, Array, Intrinsics, ProxyMaps
-from .evidence import (
-    CAMERA_OVER_FLOOR,
-    CAMERA_OVER_TABLE,
-    CEILING_HEIGHT,
-    CEILING_OVER_FLOOR,
-    DISTANCE,
-    DOOR,
-    DOORS,
-    FLOORS,
-    FURNITURE,
-    SURFACE,
-    TOPS,
-    Evidence,
-    Mode,
-    Sizes,
-    measured,
-)
+from . import evidence
+from .evidence import Evidence, Mode, Sizes, measured
 
 MIN_CONFIDENCE = 0.3
 _SIDE = 200
@@ -172,9 +157,9 @@ def floor_trust(scene: Scene) -> float | None:
     floor = scene.kind == FLOOR
     weight = scene.voxels.weight
     total = float(weight[floor].sum())
-    if not total or float(weight[floor & scene.named(FURNITURE)].sum()) > _MOSTLY * total:
+    if not total or float(weight[floor & scene.named(evidence.FURNITURE)].sum()) > _MOSTLY * total:
         return None
-    called = float(weight[floor & scene.named(FLOORS)].sum()) > _MOSTLY * total
+    called = float(weight[floor & scene.named(evidence.FLOORS)].sum()) > _MOSTLY * total
     return _NO_FLOOR if called and scene.is_named else _UNNAMED_FLOOR
 
 
@@ -186,8 +171,8 @@ def camera_height(scene: Scene) -> list[Evidence]:
     height = float(np.median(heights))
     if height < _MIN_HEIGHT * scene.median_depth:
         return []
-    held = measured("floor height", "camera height", height, CAMERA_OVER_FLOOR, length_sd=0.02)
-    table_metres, table_sd = CAMERA_OVER_TABLE
+    held = measured("floor height", "camera height", height, evidence.CAMERA_OVER_FLOOR, length_sd=0.02)
+    table_metres, table_sd = evidence.CAMERA_OVER_TABLE
     modes = [Mode(m.log_scale, m.sd, m.weight * (1 - wrong)) for m in held.modes]
     modes.append(Mode(float(np.log(table_metres / height)), table_sd, wrong))
     return [Evidence(held.source, held.kind, tuple(modes), 0.03)]
@@ -215,12 +200,16 @@ def ceiling_height(scene: Scene) -> list[Evidence]:
     if height <= 0:
         return []
     wrong = max(wrong, 0.1)
-    return [measured("ceiling height", CEILING_HEIGHT, height, CEILING_OVER_FLOOR, wrong=wrong, length_sd=0.02)]
+    return [
+        measured(
+            "ceiling height", evidence.CEILING_HEIGHT, height, evidence.CEILING_OVER_FLOOR, wrong=wrong, length_sd=0.02
+        )
+    ]
 
 
 def usual_distance(scene: Scene) -> Evidence:
     """Return the evidence of usual distances in a video of a room: weak, and always available."""
-    return measured("usual distances", "distance", scene.median_depth, DISTANCE, wrong=0.02)
+    return measured("usual distances", "distance", scene.median_depth, evidence.DISTANCE, wrong=0.02)
 
 
 def sizes_of_things(scene: Scene) -> list[Evidence]:
@@ -238,7 +227,7 @@ def _tops(scene: Scene, heights: Array, upward: Array) -> list[Evidence]:
     above = (upward > _LEVEL) & (heights > _OVER_FLOOR * scene.median_depth)
     above &= ~disputed(scene.label, scene.names, scene.voxels)
     known: dict[str, list[tuple[float, Sizes]]] = defaultdict(list)
-    for name, (label, sizes) in TOPS.items():
+    for name, (label, sizes) in evidence.TOPS.items():
         for members in _instances(scene, above & scene.named((name,)), _MIN_TOP):
             found = _levels(scene, heights, members)
             if found:
@@ -252,12 +241,12 @@ def _tops(scene: Scene, heights: Array, upward: Array) -> list[Evidence]:
 
 def _doors(scene: Scene, heights: Array, upward: Array) -> list[Evidence]:
     """Upper ends of upright surfaces that are called doors and begin at the floor."""
-    upright = (np.abs(upward) < _UPRIGHT) & scene.named(DOORS)
+    upright = (np.abs(upward) < _UPRIGHT) & scene.named(evidence.DOORS)
     found = []
     for members in _instances(scene, upright, _MIN_DOOR)[:_MAX_OF_A_KIND]:
         low, high = np.quantile(heights[members], [0.03, 0.97])
         if high > 0 and low < 0.15 * high:  # a mirror shows doors under the floor too
-            found.append(measured("door", "door", float(high), DOOR, wrong=_WRONG_NAME, length_sd=0.06))
+            found.append(measured("door", "door", float(high), evidence.DOOR, wrong=_WRONG_NAME, length_sd=0.06))
     return found
 
 
@@ -268,7 +257,7 @@ def _surfaces(scene: Scene, heights: Array) -> list[Evidence]:
         return []
     found = _levels(scene, heights, members)
     return [
-        measured("level surface", "surface", height, SURFACE, wrong=_WRONG_SURFACE, length_sd=_LENGTH_SD)
+        measured("level surface", "surface", height, evidence.SURFACE, wrong=_WRONG_SURFACE, length_sd=_LENGTH_SD)
         for height in found[:_MAX_OF_A_KIND]
         if height > _OVER_FLOOR * scene.median_depth
     ]
@@ -285,10 +274,7 @@ def _instances(scene: Scene, members: NDArray[np.bool_], least: int) -> list[NDA
     index = np.flatnonzero(members)
     if len(index) < least or scene.floor is None:
         return []
-    up = scene.floor.normal
-    first = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
-    first /= np.linalg.norm(first)
-    plan = scene.voxels.position[index] @ np.stack([first, np.cross(up, first)], 1)
+    plan = scene.voxels.position[index] @ np.linalg.svd(scene.floor.normal[None])[2][1:].T
     cell = np.floor((plan - plan.min(0)) / (_CELL * scene.voxels.size)).astype(np.int64)
     occupied = np.zeros(cell.max(0) + 1, bool)
     occupied[cell[:, 0], cell[:, 1]] = True

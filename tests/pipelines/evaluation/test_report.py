@@ -167,10 +167,7 @@ def test_report_of_a_run_without_a_map_and_with_lost_frames(oracle_run: OracleRu
     TRAJECTORY.save(run.stage("tracking"), lost)
     note_finished(run, ("frames", "proxy", "tracking"))
     outcome = load_outcome(run)
-    assert [(s.first, s.last, s.reason) for s in lost_stretches(outcome)] == [
-        (5, 7, "too few matches"),
-        (8, 8, "blurred"),
-    ]
+    assert lost_stretches(outcome) == ["frames 5–7 (0.50–0.70 s): too few matches", "frames 8–8 (0.80–0.80 s): blurred"]
     html = write_report(run).read_text()
     assert "frames 5–7 (0.50–0.70 s): too few matches" in html
     assert "4 of 32 frames have no pose" in html

@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from msgs_slam.pipelines.config import ExportConfig
+from msgs_slam.pipelines.config import Config, ExportConfig
 from msgs_slam.pipelines.export.mesh import (
     Planes,
-    draw,
     find_planes,
     keyframe_rows,
     mesh_views,
     planes_in,
     planes_of,
-    snap,
     snap_to_planes,
 )
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
@@ -25,6 +23,9 @@ from msgs_slam.pipelines.geometry.voxels import Voxels
 from msgs_slam.pipelines.mapping.measure import MeshView
 from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.stages import StageContext
+from msgs_slam.pipelines.run.tasks import in_chunks
+from msgs_slam.pipelines.scene.world import SAME
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import Intrinsics
@@ -123,15 +124,19 @@ def test_no_surface_has_no_planes(count: int) -> None:
 
 def test_views_of_a_run_are_made_straight_once(oracle_run: OracleRun, tmp_path: Path) -> None:
     run = oracle_run(video=True)
-    outcome = load_outcome(run)
-    count = len(keyframe_rows(outcome))
-    draw(outcome, ExportConfig(planes=False), tmp_path / "off", SilentProgress(), range(count))
-    assert mesh_views(tmp_path / "off", count)[0].unsure is None
-    draw(outcome, ExportConfig(), tmp_path, SilentProgress(), range(count))
-    assert mesh_views(tmp_path, count)[0].unsure is not None
-    planes = planes_in(tmp_path, count)
-    snap(tmp_path, planes, SilentProgress(), range(count))
-    done = {path: path.read_bytes() for path in tmp_path.glob("*.npz")}
-    assert all(v.unsure is None for v in mesh_views(tmp_path, count))
-    snap(tmp_path, planes_in(tmp_path, count), SilentProgress(), range(count))
-    assert done == {path: path.read_bytes() for path in tmp_path.glob("*.npz")}
+    count = len(keyframe_rows(load_outcome(run)))
+
+    def context(planes: bool) -> StageContext:
+        config = Config(export=ExportConfig(planes=planes))
+        return StageContext(run, run.root, config, tmp_path / str(planes), SilentProgress())
+
+    for planes in (False, True):
+        in_chunks(context(planes), draw_keyframes, count, move=SAME)
+        scratch = context(planes).snapshot / "mesh"
+        assert (mesh_views(scratch, count)[0].unsure is not None) == planes
+    found = []
+    for _ in range(2):
+        in_chunks(context(True), snap_views, count, planes=planes_in(scratch, count))
+        found.append({path: path.read_bytes() for path in scratch.glob("*.npz")})
+    assert all(v.unsure is None for v in mesh_views(scratch, count))
+    assert found[0] == found[1]
