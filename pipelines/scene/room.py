@@ -199,12 +199,8 @@ def ceiling_height(scene: Scene) -> list[Evidence]:
     height = float((ceiling.point - floor.point) @ floor.normal)
     if height <= 0:
         return []
-    wrong = max(wrong, 0.1)
-    return [
-        measured(
-            "ceiling height", evidence.CEILING_HEIGHT, height, evidence.CEILING_OVER_FLOOR, wrong=wrong, length_sd=0.02
-        )
-    ]
+    kind, sizes = evidence.CEILING_HEIGHT, evidence.CEILING_OVER_FLOOR
+    return [measured("ceiling height", kind, height, sizes, wrong=max(wrong, 0.1), length_sd=0.02)]
 
 
 def usual_distance(scene: Scene) -> Evidence:

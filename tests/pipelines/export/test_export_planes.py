@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from msgs_slam.pipelines.config import Config, ExportConfig
 from msgs_slam.pipelines.export.mesh import (
     Planes,
+    draw_keyframes,
     find_planes,
     keyframe_rows,
     mesh_views,
     planes_in,
     planes_of,
     snap_to_planes,
+    snap_views,
 )
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.geometry.voxels import Voxels
