@@ -86,14 +86,6 @@ def test_a_long_shelf_before_a_wall_is_no_riddle(deep: float, top: float) -> Non
     assert found[0].length == pytest.approx(6.4, rel=0.02)
 
 
-def test_pieces_far_apart_are_no_wall() -> None:
-    """Two short sheets that happen to stand in line, in the middle of nothing."""
-    sheets = [sheet(ROOM[k], ROOM[(k + 1) % 6], 0, 2.6) for k in range(6)]
-    sheets += [sheet(np.array([x, 2.0]), np.array([x + 0.5, 2.0]), 0, 1.6) for x in (1.0, 2.4)]
-    mesh = trimesh.util.concatenate(sheets)
-    assert len(find_walls(mesh.vertices, mesh.faces)) == 6
-
-
 def test_a_wall_that_ends_unseen_says_so_and_nothing_upright_is_none() -> None:
     mesh = sheet(np.array([0.0, 0]), np.array([4.0, 0]), 0, 2.5) + sheet(np.array([4.0, 0]), np.array([4.0, 3]), 0, 2.5)
     walls = find_walls(mesh.vertices, mesh.faces)

@@ -167,12 +167,6 @@ def test_unseen_vertices_are_as_the_nearest_seen_one() -> None:
     assert (colors[1] == colors[0]).all()
 
 
-def test_unseen_vertices_are_grey_and_void() -> None:
-    colors, labels = paint(np.array([[9, 9, 9]], np.float32), [painted(see_ball(0.0))], (0, 1), 0.1)
-    assert colors.tolist() == [[128, 128, 128]]
-    assert labels.tolist() == [VOID]
-
-
 def test_voxels_grow_until_the_blocks_fit() -> None:
     fine, coarse = fused(6), fused(6, max_blocks=150)
     assert len(coarse.blocks) <= 150 < len(fine.blocks)

@@ -30,20 +30,17 @@ from msgs_slam.pipelines.scene.metres import (
     is_room,
     known_evidence,
     load_seen,
-    scene_evidence,
     usual_evidence,
 )
 from msgs_slam.pipelines.scene.room import (
     Scene,
-    SeenFrame,
-    build_scene,
     camera_height,
     ceiling_height,
     floor_trust,
     sizes_of_things,
 )
 from msgs_slam.pipelines.system.progress import SilentProgress
-from msgs_slam.pipelines.types import VOID, Intrinsics, Metres, ProxyMaps
+from msgs_slam.pipelines.types import Metres
 
 STAGES_DONE = ("frames", "proxy", "tracking", "mapping")
 OracleRun = Callable[..., RunFolder]
@@ -263,22 +260,6 @@ def test_a_ceiling_that_is_not_over_the_floor_tells_nothing() -> None:
     assert ceiling_height(below) == []
     above = scene([FLOOR_PART, (plane((0, 5), (0, 4), 2.4), CEILING, "ceiling")], CENTRES)
     assert len(ceiling_height(above)) == 1
-
-
-@pytest.mark.parametrize("sure", [0, 1, 9])
-def test_a_few_sure_pixels_make_a_scene_of_which_nothing_is_known(sure: int) -> None:
-    """Too few and too scattered for a single voxel."""
-    depth, confidence = np.zeros((40, 30), np.float32), np.zeros((40, 30), np.float32)
-    depth.ravel()[: 130 * sure : 130], confidence.ravel()[: 130 * sure : 130] = 2.0, 0.9
-    maps = ProxyMaps(depth, confidence, np.full(depth.shape, VOID, np.uint8), confidence)
-    frame = SeenFrame(np.zeros((40, 30, 3), np.uint8), maps, np.eye(4))
-    found = build_scene([frame], Intrinsics(30, 40, 30.0, 30.0, 15.0, 20.0), (), True)
-    if not sure:
-        assert found is None
-        return
-    assert len(found.voxels) == 0
-    assert not found.gravity.is_sure
-    assert [p.source for p in scene_evidence(found)] == ["usual distances"]
 
 
 def test_on_stairs_the_floor_tells_nothing() -> None:
