@@ -40,10 +40,7 @@ _ROWS = 3
 
 
 def write_report(
-    run: RunFolder,
-    path: Path | None = None,
-    progress: Progress | None = None,
-    overwrite: bool = False,
+    run: RunFolder, path: Path | None = None, progress: Progress | None = None, overwrite: bool = False
 ) -> Path:
     """Write RUN/report.html, or `path`; returns where. What has not been done yet is left out.
 

@@ -63,11 +63,7 @@ def write_usd(scene: ExportScene, target: Target) -> None:
 
 
 def write_usdz(
-    path: Path,
-    mesh: MeshArrays | TexturedMesh,
-    names: tuple[str, ...],
-    turn: Array,
-    metres_per_unit: float,
+    path: Path, mesh: MeshArrays | TexturedMesh, names: tuple[str, ...], turn: Array, metres_per_unit: float
 ) -> None:
     """Write a package with one binary layer in it, and the texture where the mesh has one; `turn` (3, 3) makes y up.
     Raises DiskFullError where there is no room for it."""

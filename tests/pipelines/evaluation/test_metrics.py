@@ -19,15 +19,7 @@ from msgs_slam.formats.datasets import Dataset
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.reading import file_sha256
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
-from msgs_slam.pipelines.evaluation.metrics import (
-    DepthErrorSum,
-    open_lpips,
-    psnr,
-    sees,
-    ssim,
-    surface_error,
-    thinned,
-)
+from msgs_slam.pipelines.evaluation.metrics import DepthErrorSum, open_lpips, psnr, sees, ssim, surface_error, thinned
 from msgs_slam.pipelines.evaluation.write import evaluation_table
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.networks.registry import ModelStore

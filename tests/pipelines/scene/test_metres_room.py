@@ -32,13 +32,7 @@ from msgs_slam.pipelines.scene.metres import (
     load_seen,
     usual_evidence,
 )
-from msgs_slam.pipelines.scene.room import (
-    Scene,
-    camera_height,
-    ceiling_height,
-    floor_trust,
-    sizes_of_things,
-)
+from msgs_slam.pipelines.scene.room import Scene, camera_height, ceiling_height, floor_trust, sizes_of_things
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Metres
 
