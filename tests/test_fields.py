@@ -8,7 +8,6 @@ from tests.test_architecture import ROOT, names_imported_by
 
 ROOMS = ("formats", "pipelines", "msgs_cli", "msgs_slam", "tests/benchmarks")
 READ_ELSEWHERE = {
-    "evaluation.evaluate.MeasuredView": "written to evaluation.json as a whole",
     "evaluation.metrics.DepthError": "written to evaluation.json as a whole",
     "evaluation.metrics.SurfaceError": "written to evaluation.json as a whole",
     "evaluation.truth.ErrorStatistics": "written to evaluation.json as a whole",

@@ -1,7 +1,7 @@
 """A run against the truth: every cell of the table, or why it is empty."""
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -222,29 +222,6 @@ def cost_cells(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True)
-class MeasuredView:
-    """One rendered frame; lpips NaN where it cannot be had. label_accuracy: share of the pixels with a true class that
-    have it; NaN where the classes' names differ."""
-
-    frame_id: int
-    kind: str
-    psnr: float
-    ssim: float
-    lpips: float
-    label_accuracy: float
-
-    @property
-    def is_new_pose(self) -> bool:
-        """Whether the pose is another than the run's: only the image is compared, depth and labels count once a
-        frame."""
-        return self.kind.endswith((AT_TRUE_POSES, AT_REFINED_POSES))
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the figures by name, with None for NaN."""
-        return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in asdict(self).items()}
-
-
 class Measured:
     """Sums over the views of a run: keyframes, held-out frames and frames between at the run's own poses; held-out
     frames also at poses refined on the map, and frames not used for the map at the true ones."""
@@ -252,8 +229,8 @@ class Measured:
     def __init__(self, outcome: Outcome, matched: MatchedTruth, matching: Matching | None) -> None:
         self.outcome, self.matched, self.matching = outcome, matched, matching
         self.pixels, self.lpips, self.depth = FramePixels(outcome.calibration), open_lpips(), DepthErrorSum()
-        self.views: list[MeasuredView] = []
-        self.depth_frames: list[int] = []
+        self.views: list[dict[str, Any]] = []
+        self.depth_views: list[dict[str, Any]] = []
         true_classes, classes = len(matched.sequence.class_names), len(outcome.classes.names)
         self.confusion: Counts = np.zeros((true_classes, classes + 1), np.int64)
 
@@ -268,36 +245,45 @@ class Measured:
         picture, photo = view.exposed(outcome.exposure, frame.timestamp), outcome.run.image(frame)
         if left_out is not None:  # what is no part of the scene is not judged
             photo = np.where(left_out[..., None], picture, photo)
-        perceived = float("nan") if isinstance(self.lpips, str) else self.lpips(picture, photo)
         likeness = psnr(picture, photo, None if left_out is None else ~left_out)
-        found = MeasuredView(frame_id, kind, likeness, ssim(picture, photo), perceived, float("nan"))
-        if (index := int(self.matched.image[row])) >= 0 and not found.is_new_pose:
-            if (depth := self.matched.sequence.depth(index)) is not None:
-                self.depth.add(view.depth, self.pixels.sample(depth))
-                self.depth_frames.append(frame_id)
-            if (labels := self.matched.sequence.labels(index)) is not None:
-                found = replace(found, label_accuracy=self._add_labels(view.labels, self.pixels.sample(labels)))
-        self.views.append(found)
+        self.views.append({
+            "frame_id": frame_id,
+            "kind": kind,
+            "psnr": likeness if np.isfinite(likeness) else None,
+            "ssim": ssim(picture, photo),
+            "lpips": None if isinstance(self.lpips, str) else self.lpips(picture, photo),
+            "label_accuracy": None,
+            "depth_l1": None,
+        })  # fmt: skip
+        # From another pose than the run's the image alone is compared: depth and labels count once a frame.
+        if (index := int(self.matched.image[row])) < 0 or kind.endswith((AT_TRUE_POSES, AT_REFINED_POSES)):
+            return
+        if (depth := self.matched.sequence.depth(index)) is not None:
+            self.depth.add(view.depth, self.pixels.sample(depth))
+            self.depth_views.append(self.views[-1])
+        if (labels := self.matched.sequence.labels(index)) is not None:
+            self.views[-1]["label_accuracy"] = self._add_labels(view.labels, self.pixels.sample(labels))
 
-    def _add_labels(self, labels: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
+    def _add_labels(self, labels: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float | None:
+        """Share of the pixels with a true class that have it; None where the classes' names differ."""
         counts = count_labels(labels, truth, self.confusion.shape[1] - 1, len(self.confusion))
         self.confusion += counts
         joined = None if self.matching is None else self.matching.joined(counts)
         if joined is None or joined.sum() == 0:
-            return float("nan")
+            return None
         return float(np.trace(joined[:, :-1]) / joined.sum())
 
     def images(self) -> dict[str, Any]:
         """Mean PSNR, SSIM and LPIPS by kind of view."""
         cells: dict[str, Any] = {}
         missing = {"missing": self.lpips} if isinstance(self.lpips, str) else None
-        for kind in dict.fromkeys(v.kind for v in self.views):
-            chosen = [v for v in self.views if v.kind == kind]
-            finite = [v.psnr for v in chosen if np.isfinite(v.psnr)]
+        for kind in dict.fromkeys(v["kind"] for v in self.views):
+            chosen = [v for v in self.views if v["kind"] == kind]
+            finite = [v["psnr"] for v in chosen if v["psnr"] is not None]
             cells[kind] = {
                 "psnr": float(np.mean(finite)) if finite else None,
-                "ssim": float(np.mean([v.ssim for v in chosen])),
-                "lpips": missing or float(np.mean([v.lpips for v in chosen])),
+                "ssim": float(np.mean([v["ssim"] for v in chosen])),
+                "lpips": missing or float(np.mean([v["lpips"] for v in chosen])),
                 "views": len(chosen),
             }
         if HELD_OUT not in cells:
@@ -308,16 +294,17 @@ class Measured:
         """Collect the groups images, depth, labels and views of the result."""
         depth, is_metric = self.depth.result(), self.outcome.metric
         depth_cells: dict[str, Any] = {"missing": "no rendered view has a true depth"}
-        l1_of: dict[int, float | None] = {}
         if depth is not None:
             depth_cells = asdict(depth) | ({} if is_metric else {"metric_l1": {"missing": FREE_RUN}})
-            l1_of = dict(zip(self.depth_frames, self.depth.l1(1.0 if is_metric else depth.scale), strict=True))
+            of_views = self.depth.l1(1.0 if is_metric else depth.scale)
+            for view, l1 in zip(self.depth_views, of_views, strict=True):
+                view["depth_l1"] = l1
         names = self.matched.sequence.class_names
         return {
             "images": self.images(),
             "depth": depth_cells,
             "labels": label_cells(self.confusion, self.matching, self.outcome.semantics, names),
-            "views": [v.to_json() | {"depth_l1": None if v.is_new_pose else l1_of.get(v.frame_id)} for v in self.views],
+            "views": self.views,
         }
 
 

@@ -206,15 +206,13 @@ def _write_larger(
         frame = by_index[picture.source_index]
         reduced = reduce_image(picture.rgb, side)
         image = reduced if lens.is_straight else lens.undistort_image(reduced)
-        _require_same(outcome.run.image(frame), image, source.path, frame)
+        kept = outcome.run.image(frame)
+        small = cv2.resize(image, (kept.shape[1], kept.shape[0]), interpolation=cv2.INTER_AREA)
+        if np.abs(small.astype(np.int16) - kept).mean() > _MOST_DIFFERENT:
+            what = f"its image {frame.source_index} is not that of frame {frame.id}"
+            raise InputError(f"{source.path} has changed: {what}")
         write_rgb(folder / frame.name, image)
 
     count = sum(1 for _ in parallel_map(write, source.read(by_index), get_threads()))
     if count < len(frames):
         raise InputError(f"only {count} of {len(frames)} frames could be read again from {source.path}")
-
-
-def _require_same(frame: NDArray[np.uint8], image: NDArray[np.uint8], source: Path, about: Frame) -> None:
-    small = cv2.resize(image, (frame.shape[1], frame.shape[0]), interpolation=cv2.INTER_AREA)
-    if np.abs(small.astype(np.int16) - frame).mean() > _MOST_DIFFERENT:
-        raise InputError(f"{source} has changed: its image {about.source_index} is not that of frame {about.id}")

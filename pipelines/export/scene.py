@@ -95,12 +95,6 @@ def find_world(outcome: Outcome, settings: ExportConfig) -> tuple[World, list[st
     return world, [*reasons, reason] if reason else reasons
 
 
-def kept_world(outcome: Outcome, settings: ExportConfig) -> World | None:
-    """Return the world of the run's own export, so that what is written later fits; None for other settings."""
-    own = outcome.config.export
-    return outcome.run.find(WORLD) if (settings.axes, settings.gps) == (own.axes, own.gps) else None
-
-
 def estimate_metres(context: StageContext, outcome: Outcome, world: World) -> Metres | None:
     """Find how long the unit of the run's own world is: by GPS, else by `find_metres`, whose doubts are warned of."""
     if world.earth is not None:
@@ -114,10 +108,12 @@ def estimate_metres(context: StageContext, outcome: Outcome, world: World) -> Me
 
 
 def finished_scene(outcome: Outcome, context: StageContext) -> ExportScene:
-    """Return the scene of a run as its own export has found it, but for settings of `context` that differ."""
-    settings = context.config.export
+    """Return the scene of a run in the world of its own export, so that what is written later fits, but for settings of
+    `context` that differ."""
+    settings, own = context.config.export, outcome.config.export
     outcome.require_map()
-    if (world := kept_world(outcome, settings)) is None:
+    is_same = (settings.axes, settings.gps) == (own.axes, own.gps)
+    if (world := outcome.run.find(WORLD) if is_same else None) is None:
         world, reasons = find_world(outcome, settings)
         for reason in reasons:
             context.warn(reason)

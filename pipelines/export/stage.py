@@ -1,4 +1,4 @@
-"""Stage 6, the files for other programs: of a run (`ExportStage`), and of a finished one on request (`export_run`);
+"""Stage 6, the files for other programs: of a run (`run`), and of a finished one on request (`export_run`);
 with README.txt: what each file is for, what the coordinates mean, and whose networks it rests on.
 
 Each disconnected component of a run becomes a small run inside it, RUN/piece_2 and so on, with frames, world and unit
@@ -75,51 +75,30 @@ unknown or was not asked for (export.axes).
 
 
 def run(context: StageContext) -> dict[str, Any]:
-    """Write all files of a run whose map is done; a mesh that an interrupted attempt has finished is kept."""
-    return ExportStage(context).run()
-
-
-class ExportStage:
-    """The stage: `run` is the order of its work. Its files lie in the folder of its context."""
-
-    scene: ExportScene
-    metres: Metres | None
-
-    def __init__(self, context: StageContext) -> None:
-        self.context, self.target = context, Target(context.folder)
-
-    def run(self) -> dict[str, Any]:
-        """Write all, and return the figures of the report."""
-        self.open_scene()
-        write_pieces(self.context)
-        kinds = stage_exports(self.context.run)
-        self.write(export for export in kinds if export.kind != "mesh")
-        write_notes(self.scene, self.target, self.metres)
-        images, gaussians = int(self.scene.outcome.trajectory.is_placed.sum()), len(self.scene.outcome.require_map())
-        self.scene = self.scene.without_map()
-        release_free_memory()
-        self.write(export for export in kinds if export.kind == "mesh")
-        write_readme(self.scene, self.target, files_in(self.target.folder))
-        mesh = mesh_figures(self.target.folder / "mesh.ply")
-        world, metres = world_figures(self.scene.world), metres_figures(self.metres)
-        return {"images": images, "gaussians": gaussians, **mesh, **world, **metres}
-
-    def open_scene(self) -> None:
-        """Find which way is up, where on the Earth the scene is, and how many metres a unit is."""
-        found = load_outcome(self.context.run, self.context.device)
-        found.require_map()
-        world, reasons = find_world(found, self.context.config.export)
-        for reason in reasons:
-            self.context.warn(reason)
-        self.metres = estimate_metres(self.context, found, world)
-        self.scene = ExportScene(in_world(replace(found, metres=self.metres), world), world, self.context)
-        del found  # one map is enough
-        release_free_memory()
-
-    def write(self, exports: Iterable[Export]) -> None:
-        """Write the kinds of files that the stage makes."""
-        for export in exports:
-            export.writer()(self.scene, self.target)
+    """Write all files of a run whose map is done, and return the figures of the report; a mesh that an interrupted
+    attempt has finished is kept."""
+    found = load_outcome(context.run, context.device)
+    found.require_map()
+    world, reasons = find_world(found, context.config.export)
+    for reason in reasons:
+        context.warn(reason)
+    metres = estimate_metres(context, found, world)
+    scene = ExportScene(in_world(replace(found, metres=metres), world), world, context)
+    del found  # one map is enough
+    release_free_memory()
+    write_pieces(context)
+    target, kinds = Target(context.folder), stage_exports(context.run)
+    for export in (export for export in kinds if export.kind != "mesh"):
+        export.writer()(scene, target)
+    write_notes(scene, target, metres)
+    figures = {"images": int(scene.outcome.trajectory.is_placed.sum()), "gaussians": len(scene.outcome.require_map())}
+    scene = scene.without_map()
+    release_free_memory()
+    for export in (export for export in kinds if export.kind == "mesh"):
+        export.writer()(scene, target)
+    write_readme(scene, target, files_in(target.folder))
+    mesh = mesh_figures(target.folder / "mesh.ply")
+    return {**figures, **mesh, **world_figures(world), **metres_figures(metres)}
 
 
 def stage_exports(run: RunFolder) -> list[Export]:
