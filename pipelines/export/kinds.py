@@ -258,12 +258,3 @@ def kinds_help() -> str:
         settings = f" ({', '.join(export.settings)})" if export.settings else ""
         lines.append(f"{export.kind.ljust(width)}  {export.about}{settings}")
     return "\n".join(lines)
-
-
-def files_table() -> str:
-    """Return the rows of the table in docs/files.md."""
-    lines = []
-    for export in EXPORTS:
-        request = "" if export.when == "always" else f"by `msgs-slam export RUN --only {export.kind}`: "
-        lines += [f"| `{f.name}` | {request}{f.about} | {f.opens} |" for f in export.files]
-    return "\n".join([*lines, *(f"| `{f.name}` | {f.about} | {f.opens} |" for f in NOTES)])

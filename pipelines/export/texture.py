@@ -81,8 +81,10 @@ class Shot:
 
 def texels_wanted(vertices: NDArray[np.float32], faces: NDArray[np.int32], shots: Sequence[Shot]) -> float:
     """Texels a unit of length at which nine of ten vertices keep the pixels of the view that sees them closest."""
-    normals = vertex_normals(vertices, faces)
-    density = functools.reduce(np.maximum, (_density(vertices, normals, shot) for shot in shots))
+    total = normal_sums(vertices.astype(np.float64), faces)
+    normals = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+    seen = (_density(vertices, normals, shot) for shot in shots)
+    density = functools.reduce(np.maximum, seen, np.zeros(len(vertices)))
     return float(np.quantile(density[density > 0], 0.9)) if (density > 0).any() else 1.0
 
 
@@ -101,12 +103,6 @@ def paint_texture(atlas: Atlas, shots: Sequence[Shot], progress: Progress) -> ND
     of_mesh = (atlas.corners, atlas.corner_faces, base, is_painted)
     _in_bands(atlas.height, lambda a, b: _finish(total[a:b], owner[a:b], a, *of_mesh))
     return np.round(_filled(total)[..., :3].clip(0, 1) * 255).astype(np.uint8)
-
-
-def vertex_normals(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> NDArray[np.float64]:
-    """(V, 3) unit normals, faces weighted by their area; 0 for a vertex without faces."""
-    total = normal_sums(vertices.astype(np.float64), faces)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
 
 
 def _density(vertices: NDArray[np.float32], normals: NDArray[np.float64], shot: Shot) -> NDArray[np.float64]:

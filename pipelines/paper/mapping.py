@@ -1,7 +1,5 @@
 """The map: where it grows, and what it is optimised for (section 3.4)."""
 
-from collections.abc import Mapping
-
 import cv2
 import numpy as np
 import torch
@@ -234,19 +232,8 @@ def optimise(
     clip_at_boundary(shown.features, view.channels, constants.clip)
     loss = map_loss(shown, view, values["log_radii"], classes, unit, constants)
     gradients = dict(zip(values, torch.autograd.grad(loss, list(values.values()), allow_unused=True), strict=True))
-    step(gaussians, gradients, rows, rate, constants)
-    return float(loss.detach())
-
-
-def step(
-    gaussians: Gaussians,
-    gradients: Mapping[str, Tensor | None],
-    rows: Tensor,
-    rate: float,
-    constants: Constants = PAPER,
-) -> None:
-    """Adam for the rows (n,): positions by steps in proportion to the radius, and shorter ones where U is low."""
-    radii = torch.exp(gaussians.table.values["log_radii"].detach()[rows])
+    # Positions by steps in proportion to the radius, and shorter ones where U is low.
     shares = torch.where(gaussians.trust[rows] > constants.tau_low, 1.0, constants.low_step)
-    rates = {k: r * rate for k, r in RATES.items()}
-    gaussians.table.step(gradients, rates, {"means": radii * shares}, rows)
+    scales = {"means": torch.exp(values["log_radii"].detach()) * shares}
+    gaussians.table.step(gradients, {k: r * rate for k, r in RATES.items()}, scales, rows)
+    return float(loss.detach())

@@ -21,7 +21,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export import texture as textured
-from msgs_slam.pipelines.export.kinds import EXPORTS, Export, export_of, files_table, kinds_help
+from msgs_slam.pipelines.export.kinds import EXPORTS, NOTES, Export, export_of, kinds_help
 from msgs_slam.pipelines.export.scene import ExportScene, find_world
 from msgs_slam.pipelines.export.stage import export_folder, export_run, licences
 from msgs_slam.pipelines.geometry.camera import project
@@ -216,7 +216,10 @@ def test_free_scale_holds_in_every_file(oracle_run: OracleRun, tmp_path: Path, m
 def test_each_kind_is_one_row(tmp_path: Path) -> None:
     """Its writer takes a scene and a target; help, the page of files and refusals name it."""
     page = (Path(__file__).parents[3] / "docs" / "files.md").read_text(encoding="utf-8")
-    assert files_table() in page
+    for row in EXPORTS:
+        request = "" if row.when == "always" else f"by `msgs-slam export RUN --only {row.kind}`: "
+        assert all(f"| `{f.name}` | {request}{f.about} | {f.opens} |\n" in page for f in row.files)
+    assert all(f"| `{f.name}` | {f.about} | {f.opens} |\n" in page for f in NOTES)
     said = CliRunner().invoke(main, ["export", "--help"]).output
     names = [name for row in EXPORTS for name in (row.kind, *row.also)]
     assert len(set(names)) == len(names)
