@@ -280,8 +280,6 @@ VIDEO, TRUTH = "room.mp4", "room_truth"
 CLIP = Path(__file__).with_name("demo_clip")
 """The video, and its truth without the images as a zip: 36 frames of a made-up room (tests/world/demo_clip.py)."""
 
-_SUMMARY = ("frames posed", "ATE Sim(3), all", "PSNR at keyframes", "focal length", "depth L1, after one scale")
-
 
 @dataclass(frozen=True)
 class DemoResult:
@@ -325,10 +323,15 @@ def run_demo(
 
 def demo_summary(result: DemoResult) -> list[str]:
     """Return a few lines for a person: the errors, and where to look."""
-    lines = [
-        f"{what.partition(':')[0]}: {value} ({of})"
-        for what, value, of in evaluation_rows(result.figures)
-        if what.startswith(_SUMMARY)
-    ]
-    folder = result.run.evaluation_file.parent
+    figures, folder = result.figures, result.run.evaluation_file.parent
+    frames, camera, depth, psnr = (figures[key] for key in ("frames", "camera", "depth", "keyframe psnr"))
+    ate = figures["trajectory"].get("sim3 all", figures["trajectory"])
+    path = None if "missing" in ate else f"camera path: {100 * ate['rmse']:.2f} cm RMSE after Sim(3)"
+    lines = [f"{frames['posed']} of {frames['picked']} frames posed", path or f"no camera path: {ate['missing']}"]
+    if psnr is not None:
+        lines.append(f"map: {psnr:.1f} dB PSNR at keyframes")
+    if "focal error" in camera:
+        lines.append(f"focal length: {camera['focal error']:+.2%} off ({camera['origin']})")
+    if "scaled_l1" in depth:
+        lines.append(f"depth: {100 * depth['scaled_l1']:.1f} cm mean error after one scale")
     return [*lines, f"images: {folder / 'views.png'}", f"tables: {folder / 'evaluation.md'}"]
