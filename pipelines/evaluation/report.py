@@ -101,8 +101,8 @@ def _heading(outcome: Outcome, target: Path) -> str:
     source = escape(str(load_source(outcome.run).path))
     after = _AFTER.get(outcome.map_stage or outcome.pose_stage, "")
     head, run = f'<h1>{escape(outcome.run.place.name)}</h1><p class="sub">Source: {source}{after}</p>', outcome.run
-    is_beside = target.resolve().parent == run.root.resolve() and run.has("export", WEB_PAGE)
-    link = f'<p><a href="export/{WEB_PAGE}">The map in one page</a>, to look at and to send.</p>' if is_beside else ""
+    in_run = target.resolve().parent == run.root.resolve() and run.has("export", WEB_PAGE)
+    link = f'<p><a href="export/{WEB_PAGE}">The map in one page</a>, to look at and to send.</p>' if in_run else ""
     return head + chips(pairs) + link
 
 

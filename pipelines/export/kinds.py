@@ -1,5 +1,5 @@
-"""The kinds of files that an export consists of: one row each, from which the help of `export --only`, README.txt and
-the table in docs/files.md are made.
+"""The kinds of files that an export consists of: one row each, from which the help of `export --only` and README.txt
+are made, and with which the table in docs/files.md is compared.
 
 To add a kind: a row here, and beside this file the function that it names. Nothing here computes.
 """

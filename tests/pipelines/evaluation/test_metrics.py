@@ -125,7 +125,7 @@ def test_what_is_seen_lies_in_the_image_and_not_behind_its_depth() -> None:
     probes = points[[465, 465, 465]] + np.array([[0, 0, -0.5], [0, 0, 0.05], [0, 0, 0.5]])
     outside = np.array([[9.0, 0, 2], [1.0, 0, -2]])
     assert sees(view, np.concatenate([probes, outside])).tolist() == [True, True, False, False, False]
-    assert len(thinned(np.repeat(points, 3, axis=0), 1e-6)) == len(points)
+    assert len(thinned(np.repeat(points, 3, axis=0), 1e-3)) == len(points)
 
 
 class StandIn:

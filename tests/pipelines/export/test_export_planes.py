@@ -130,7 +130,8 @@ def test_views_of_a_run_are_made_straight_once(oracle_run: OracleRun, tmp_path: 
 
     def context(planes: bool) -> StageContext:
         config = Config(export=ExportConfig(planes=planes))
-        return StageContext(run, run.root, config, tmp_path / str(planes), SilentProgress())
+        (folder := tmp_path / str(planes)).mkdir(exist_ok=True)
+        return StageContext(run, run.root, config, folder, SilentProgress())
 
     for planes in (False, True):
         in_chunks(context(planes), draw_keyframes, count, move=SAME)
