@@ -71,7 +71,10 @@ def render_run(
     if is_of_source(target, run):
         raise InputError(f"{target} is the source of {run.root}: name another file or folder")
     place = _target(target, 30.0 if fps is None else fps, overwrite)
-    given = None if path in PATHS else _given_path(Path(path), fps)
+    if path not in PATHS and not Path(path).is_file():
+        kinds = f"{', '.join(PATHS)}, or a camera path that `msgs-slam view` has saved"
+        raise InputError(f"path is one of {kinds}; there is no file {str(path)!r}")
+    given = None if path in PATHS else read_camera_path(Path(path), fps)
     rate = given.fps if given else 30.0 if fps is None else fps
     flight = None if given is None else given.in_world_of_run(run)
     outcome = load_outcome(run)
@@ -286,15 +289,6 @@ class CameraPath:
     def image_count(self) -> int:
         """The number of images of the flight, both ends included."""
         return max(2, round((len(self.fovs) - 1) * self.seconds_per_keyframe * self.fps) + 1)
-
-
-def _given_path(path: Path, fps: float | None) -> CameraPath:
-    if not path.is_file():
-        raise InputError(
-            f"path is one of {', '.join(PATHS)}, or a camera path that `msgs-slam view` has saved; there is no file "
-            f"{str(path)!r}"
-        )
-    return read_camera_path(path, fps)
 
 
 def read_camera_path(path: Path, fps: float | None = None) -> CameraPath:

@@ -146,6 +146,10 @@ def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Loo
     k = c.intrinsics
     spread = f" ± {c.focal_sd:.2f}" if c.focal_sd > 0 else ""
     shutter = f", rolling-shutter readout {1000 * sum(map(abs, c.readout)):.1f} ms" if any(c.readout) else ""
+    is_told = outcome.metres is not None or outcome.metric or "export" in outcome.records
+    scale = (
+        lengths(outcome.metres, outcome.metric) if is_told else "free so far: the export says how many metres a unit is"
+    )
     sides = f"centre ({k.cx:.1f}, {k.cy:.1f}), {k.width}×{k.height}{shutter}"
     rows = [
         ("camera", f"{c.origin}: focal length {k.fx:.2f}{spread} px, {sides}"),
@@ -153,7 +157,7 @@ def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Loo
             "distortion removed",
             ", ".join(f"{n} {v:.4f}" for n, v in zip(distortion_names(c.fisheye), c.distortion, strict=False)),
         ),
-        ("scale", _scale_text(outcome)),
+        ("scale", scale),
         *found_lengths(outcome),
         ("depth", str(outcome.run.load(FIGURES["proxy"]).get("depth", ""))),
         ("classes", f"{outcome.semantics}: {len(outcome.classes)}"),
@@ -168,24 +172,12 @@ def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Loo
     extra = f"<h3>Frames without a pose</h3>{bullets(lost)}" if lost else ""
     if share := outcome.records["frames"].figures.get("still_left_out"):
         rows.append(("stands still, left out", f"{share:.1%} of the image"))
-        extra += _still_picture(outcome)
+        frame = outcome.frames[len(outcome.frames) // 2]
+        photo, left_out = outcome.run.image(frame).copy(), outcome.run.left_out(frame)
+        if left_out is not None:
+            photo[left_out] = photo[left_out] // 2 + np.array([127, 0, 0], np.uint8)
+        extra += _tiles([(photo, f"left out, {frame.timestamp:.2f} s")])
     return section("What was found", table(("", ""), rows), extra)
-
-
-def _still_picture(outcome: Outcome) -> str:
-    """The middle frame, red where something is left out."""
-    frame = outcome.frames[len(outcome.frames) // 2]
-    photo, left_out = outcome.run.image(frame).copy(), outcome.run.left_out(frame)
-    if left_out is not None:
-        photo[left_out] = photo[left_out] // 2 + np.array([127, 0, 0], np.uint8)
-    return _tiles([(photo, f"left out, {frame.timestamp:.2f} s")])
-
-
-def _scale_text(outcome: Outcome) -> str:
-    if outcome.metres is not None or outcome.metric:
-        return lengths(outcome.metres, outcome.metric)
-    exported = "export" in outcome.records
-    return lengths(None, False) if exported else "free so far: the export says how many metres a unit is about"
 
 
 def _piece_section(piece: Outcome, progress: Progress) -> str:

@@ -207,7 +207,14 @@ def evaluation_rows(result: dict[str, Any]) -> list[Row]:
     name = "mesh" if "missing" in result["mesh"] else "mesh accuracy, completeness, F-score"
     mesh = "{accuracy:c} cm, {completeness:c} cm, {f_score:.1%}"
     rows.append(_row(name, result["mesh"], mesh, "F-score at {threshold:.0c} cm"))
-    return rows + _cost_rows(result["cost"])
+    cost = result["cost"]
+    stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in cost["seconds"].items())
+    return [
+        *rows,
+        _row("time", cost, "{total seconds:.1f} s", f"{{frames per second:.2f}} frames/s; {stages}"),
+        _row("peak memory", cost, "{peak memory MB:.0f} MB"),
+        _row("map", cost, "{gaussians} Gaussians", "{map MB:.1f} MB"),
+    ]
 
 
 def _trajectory_rows(result: dict[str, Any]) -> list[Row]:
@@ -264,15 +271,6 @@ def _label_rows(cells: dict[str, Any]) -> list[Row]:
     return [
         _row("mIoU, pixel accuracy", cells, text, of),
         ("IoU of each class", classes, f"{cells['unlabelled']:.1%} of the pixels were given none of them"),
-    ]
-
-
-def _cost_rows(cells: dict[str, Any]) -> list[Row]:
-    stages = ", ".join(f"{name} {s:.1f}" for name, s in cells["seconds"].items())
-    return [
-        _row("time", cells, "{total seconds:.1f} s", f"{{frames per second:.2f}} frames/s; {stages}"),
-        _row("peak memory", cells, "{peak memory MB:.0f} MB"),
-        _row("map", cells, "{gaussians} Gaussians", "{map MB:.1f} MB"),
     ]
 
 

@@ -297,8 +297,11 @@ def filled(mesh: MeshArrays, views: Iterable[PosedDepth]) -> MeshArrays:
     A triangle stays where at least one of the views looks at it, and no more look past it at another part of the mesh:
     between the bars of a chair the floor is seen.
     """
-    points = mesh.vertices.astype(np.float64)
-    if not len(rims := _rims(mesh.faces)):
+    points, count = mesh.vertices.astype(np.float64), len(mesh.vertices)
+    # Directed edges of one face alone, turned round, as a face beside it would have them.
+    edges = np.concatenate([mesh.faces[:, [1, 0]], mesh.faces[:, [2, 1]], mesh.faces[:, [0, 2]]]).astype(np.int64)
+    rims = edges[~np.isin(edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0])]
+    if not len(rims):
         return mesh
     edge = float(np.median(np.linalg.norm(points[mesh.faces[:, 0]] - points[mesh.faces[:, 1]], axis=1)))
     order = np.argsort(rims[:, 0], kind="stable")
@@ -311,13 +314,6 @@ def filled(mesh: MeshArrays, views: Iterable[PosedDepth]) -> MeshArrays:
     new = new[~folded]
     new = new[_is_seen(points[new].mean(1), points, views, edge)]
     return replace(mesh, faces=np.concatenate([mesh.faces, new.astype(np.int32)]))
-
-
-def _rims(faces: NDArray[np.int32]) -> NDArray[np.int64]:
-    """(E, 2) directed edges of one face alone, turned round, as a face beside it would have them."""
-    edges = np.concatenate([faces[:, [1, 0]], faces[:, [2, 1]], faces[:, [0, 2]]]).astype(np.int64)
-    count = int(faces.max(initial=-1)) + 1
-    return edges[~np.isin(edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0])]
 
 
 def normal_sums(points: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:

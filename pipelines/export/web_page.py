@@ -57,7 +57,11 @@ def page_of(outcome: Outcome, world: World, is_exported: bool = True, elements: 
     upright = np.eye(3) if world.axes == "up" else Z_UP_FROM_Y_DOWN
     back = SAME if is_exported else world.exported_from_run.inverse()
     about, packed = pack_cloud(cloud, upright)
-    about |= _classes(cloud, outcome) | _cameras(outcome, upright) | _unit(outcome, world)
+    about |= _classes(cloud, outcome) | _cameras(outcome, upright) | {"floor": world.has_floor}
+    about["unit"] = {"metric": outcome.metric or world.earth is not None}
+    if (metres := outcome.metres) is not None:
+        text = f"{metres.text[0].upper()}{metres.text[1:]}."
+        about["unit"] |= {"per_unit": metres.per_unit, "relative_sd": metres.relative_sd, "text": text}
     about |= {"elements": elements, "recorded": {
         "world": EXPORTED if is_exported else RUN,
         "turn": (back.rotation @ upright.T).ravel().tolist(), "shift": back.translation.tolist(),
@@ -127,14 +131,6 @@ def _cameras(outcome: Outcome, upright: NDArray[np.float64]) -> dict[str, Any]:
         "shift": [(k.cx - k.width / 2) / k.fx, (k.cy - k.height / 2) / k.fy],
         "depth": float(np.median(np.linalg.norm(means - middle, axis=1))),
     }
-
-
-def _unit(outcome: Outcome, world: World) -> dict[str, Any]:
-    unit: dict[str, Any] = {"metric": outcome.metric or world.earth is not None}
-    if (metres := outcome.metres) is not None:
-        text = f"{metres.text[0].upper()}{metres.text[1:]}."
-        unit |= {"per_unit": metres.per_unit, "relative_sd": metres.relative_sd, "text": text}
-    return {"unit": unit, "floor": world.has_floor}
 
 
 def _title(run: RunFolder) -> str:

@@ -38,21 +38,19 @@ def world_on_earth(outcome: Outcome, world: World, gps: str) -> tuple[World, str
     """
     if gps == GPS_OFF:
         return world, ""
-    places = _exif_places(outcome) if gps == GPS_AUTO else _track_places(outcome, _track(gps))
+    if gps == GPS_AUTO:
+        places: Array | str = _exif_places(outcome)
+    else:
+        track = read_track(Path(gps))
+        if track.lost:
+            lacking = "are no time or name with a latitude and longitude, and are left out"
+            log.warning("%s: %d of its rows %s", gps, track.lost, lacking)
+        places = _track_places(outcome, track)
     found = places if isinstance(places, str) else _laid_out(outcome, world, places)
     if isinstance(found, World):
         return found, ""
     log.info("not georeferenced: %s", found)
     return world, "" if gps == GPS_AUTO else f"{gps}: not georeferenced: {found}"
-
-
-def _track(gps: str) -> Track:
-    track = read_track(Path(gps))
-    if track.lost:
-        log.warning(
-            "%s: %d of its rows are no time or name with a latitude and longitude, and are left out", gps, track.lost
-        )
-    return track
 
 
 def _laid_out(outcome: Outcome, world: World, places: Array) -> World | str:
