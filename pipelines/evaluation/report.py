@@ -146,10 +146,9 @@ def _found_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Loo
     k = c.intrinsics
     spread = f" ± {c.focal_sd:.2f}" if c.focal_sd > 0 else ""
     shutter = f", rolling-shutter readout {1000 * sum(map(abs, c.readout)):.1f} ms" if any(c.readout) else ""
-    is_told = outcome.metres is not None or outcome.metric or "export" in outcome.records
-    scale = (
-        lengths(outcome.metres, outcome.metric) if is_told else "free so far: the export says how many metres a unit is"
-    )
+    scale = lengths(outcome.metres, outcome.metric)
+    if outcome.metres is None and not outcome.metric and "export" not in outcome.records:
+        scale = "free so far: the export says how many metres a unit is about"
     sides = f"centre ({k.cx:.1f}, {k.cy:.1f}), {k.width}×{k.height}{shutter}"
     rows = [
         ("camera", f"{c.origin}: focal length {k.fx:.2f}{spread} px, {sides}"),

@@ -57,11 +57,12 @@ def page_of(outcome: Outcome, world: World, is_exported: bool = True, elements: 
     upright = np.eye(3) if world.axes == "up" else Z_UP_FROM_Y_DOWN
     back = SAME if is_exported else world.exported_from_run.inverse()
     about, packed = pack_cloud(cloud, upright)
-    about |= _classes(cloud, outcome) | _cameras(outcome, upright) | {"floor": world.has_floor}
+    about |= _classes(cloud, outcome) | _cameras(outcome, upright)
     about["unit"] = {"metric": outcome.metric or world.earth is not None}
     if (metres := outcome.metres) is not None:
         text = f"{metres.text[0].upper()}{metres.text[1:]}."
         about["unit"] |= {"per_unit": metres.per_unit, "relative_sd": metres.relative_sd, "text": text}
+    about["floor"] = world.has_floor
     about |= {"elements": elements, "recorded": {
         "world": EXPORTED if is_exported else RUN,
         "turn": (back.rotation @ upright.T).ravel().tolist(), "shift": back.translation.tolist(),
