@@ -144,8 +144,7 @@ def camera_cells(outcome: Outcome, truth: Dataset) -> dict[str, Any]:
 
 
 def trajectory_cells(outcome: Outcome, matched: MatchedTruth) -> tuple[dict[str, Any], AbsoluteError | None]:
-    """ATE and RPE in the truth's unit, and the Sim(3) alignment over all frames (SE(3) where depth and truth are
-    metric)."""
+    """ATE and RPE in the truth's unit, and the alignment over all frames: Sim(3), SE(3) where both are metric."""
     t = outcome.trajectory
     usable = t.is_placed & matched.has_pose
     if usable.sum() < 3:

@@ -112,8 +112,7 @@ def _median_depth(sparse: SparseModel | None) -> float:
 
 
 def found_lengths(outcome: Outcome) -> list[tuple[str, str]]:
-    """(what, how long) of a run that is exported, in its own world; only the camera's path where nothing says which way
-    is up, and nothing before the export."""
+    """(what, how long) of an exported run in its own world; the camera's path alone where up is unknown."""
     if outcome.move is not None or "export" not in outcome.records or (world := outcome.run.find(WORLD)) is None:
         return []
     shown = in_world(outcome, world)

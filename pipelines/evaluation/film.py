@@ -127,8 +127,7 @@ def _write(place: Target, target: Path, pictures: Iterator[Picture], fps: float)
 
 
 def _of_size(outcome: Outcome, size: tuple[int, int]) -> Outcome:
-    """The same seen by a camera with so many pixels: of another shape it sees more or less at the sides, and the same
-    from top to bottom."""
+    """The same seen by a camera with so many pixels; of another shape it sees more or less at the sides."""
     k = outcome.calibration.intrinsics
     width, height = size
     scale = height / k.height
@@ -263,8 +262,7 @@ class CameraPath:
     world: str
 
     def flight(self) -> tuple[Array, Array]:
-        """(N, 4, 4) world_from_cam and (N,) fields of view in degrees: positions follow a Catmull-Rom spline, rotations
-        the shortest arc."""
+        """(N, 4, 4) world_from_cam by a Catmull-Rom spline and shortest arcs, and (N,) fields of view in degrees."""
         known = np.arange(len(self.fovs))
         at, centers = np.linspace(0, known[-1], self.image_count), self.world_from_cam[:, :3, 3]
         rotations = Slerp(known, Rotation.from_matrix(self.world_from_cam[:, :3, :3]))(at)

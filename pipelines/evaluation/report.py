@@ -268,8 +268,7 @@ def _settings_section(outcome: Outcome) -> str:
 
 
 def _map_section(outcome: Outcome, progress: Progress) -> str:
-    """Keyframes beside the map from the same place, a few seen at once and the others unfolding; colours of depth and
-    of classes."""
+    """Keyframes beside the map from the same place; colours of depth and of classes."""
     t, reach = outcome.trajectory, common_depth_range(outcome)
     rows = spread_sample(np.flatnonzero(t.is_keyframe).tolist(), SHOWN_VIEWS)
     pictures: list[tuple[Picture, str]] = []

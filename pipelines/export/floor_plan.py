@@ -273,8 +273,7 @@ def _between(angle: Array | float, other: float) -> Array:
 
 
 def _strongest_line(faces: _Faces, angle: float) -> _Line:
-    """The line that most area with about this angle lies on, as its own faces lie; of no area where that is too
-    little."""
+    """The line that most area with about this angle lies on, as its own faces lie; of no area for too little."""
     step, normal = faces.height / _STEPS, np.array([np.cos(angle), np.sin(angle)])
     faces = faces.only(faces.facing(angle))
     if float(faces.area.sum()) < (least := _MIN_AREA * faces.height**2):

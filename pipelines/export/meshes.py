@@ -37,8 +37,7 @@ def write_collision(scene: ExportScene, target: Target) -> None:
 
 
 def with_floor(points: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """The mesh (V, 3), (F, 3) with z up, and a floor at z = 0, seen from above, under everything; without one where the
-    mesh is a line from above."""
+    """The mesh (V, 3), (F, 3), z up, with a floor at z = 0 under everything; without where it is a line from above."""
     try:
         rim = points[ConvexHull(points[:, :2]).vertices, :2]  # counterclockwise
     except QhullError:

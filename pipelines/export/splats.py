@@ -45,8 +45,7 @@ _WIDEST = 0.5
 
 
 def write_splat_ply(scene: ExportScene, target: Target) -> None:
-    """Write the map as splat PLYs in its own colours and in those of the classes; the probabilities are in the first
-    only."""
+    """Write the map as splat PLYs in its own colours, with probabilities, and in those of the classes."""
     outcome = scene.outcome
     starts, names = range(0, max(len(outcome.require_map()), 1), _PART), outcome.classes.names
     clouds = LruSequence(len(starts), lambda n: scene.cloud(slice(starts[n], starts[n] + _PART)), len, 0)

@@ -105,8 +105,7 @@ def _whole_cells(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def weld(parts: Sequence[Triangles], chunks: NDArray[np.int32], voxel: float) -> Surface:
-    """The surface in a region of chunks. Vertices that neighbouring ones both have become one; triangles that thereby
-    lose their area go."""
+    """The surface in a region of chunks: vertices that neighbours share become one, triangles without area go."""
     firsts = np.cumsum([0, *(len(points) for points, _, _ in parts)], dtype=np.int32)
     points = np.concatenate([np.zeros((0, 3)), *(points for points, _, _ in parts)])
     keys = np.round(points / (voxel / _STEPS)).astype(np.int64)
@@ -240,8 +239,7 @@ class _Chosen:
 
 
 def joined(regions: Callable[[], Iterable[Region]], least_share: float = MIN_PIECE) -> MeshBlocks:
-    """The mesh of these regions, a block each, without the connected pieces that have fewer faces than `least_share` of
-    the largest one's."""
+    """The mesh of these regions, a block each, without pieces with less than `least_share` of the largest's faces."""
     sizes = [_Sizes.of(region.surface) for region in regions()]
     chosen = _choose(sizes, least_share)
     kept = [(s, c.pieces[:-1]) for s, c in zip(sizes, chosen, strict=True)]

@@ -89,8 +89,7 @@ def texels_wanted(vertices: NDArray[np.float32], faces: NDArray[np.int32], shots
 
 
 def paint_texture(atlas: Atlas, shots: Sequence[Shot], progress: Progress) -> NDArray[np.uint8]:
-    """(height, width, 3) RGB; a face that no view sees has its vertices' colours, a part of one and what no face covers
-    those beside it."""
+    """(height, width, 3) RGB; a face that no view sees has its vertices' colours, a part of one those beside it."""
     owner = owners(atlas)
     total = np.zeros((atlas.height, atlas.width, 4), np.float32)
     for shot in progress.track(shots, "texture", len(shots)):
@@ -265,8 +264,7 @@ def _shot(outcome: Outcome, frame: Frame, view: PosedDepth, sharpness: float) ->
 
 
 def simplified(mesh: MeshArrays, share: float = SHARE) -> MeshArrays:
-    """At most that share of the vertices (Garland and Heckbert 1997), down to four faces; colour and label are the
-    nearest vertex's."""
+    """At most that share of the vertices (Garland and Heckbert 1997); colour and label are the nearest vertex's."""
     from fast_simplification import simplify
 
     most, wanted = share * len(mesh.vertices), share * len(mesh.faces)

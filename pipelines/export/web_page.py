@@ -39,8 +39,7 @@ _SCRIPTS = ("cloud.js", "draw.js", "moves.js", "tape.js", "record.js", "page.js"
 
 
 def write_web_page(scene: ExportScene, target: Target) -> None:
-    """Write map.html; nothing where there are no Gaussians. Raises DiskFullError before it is made where there is no
-    room for it."""
+    """Write map.html; nothing without Gaussians. Raises DiskFullError beforehand where there is no room for it."""
     count = len(scene.outcome.require_map())
     require_room(target.folder / WEB_PAGE, _MIN_BYTES * min(count, MAX_GAUSSIANS))
     if count:

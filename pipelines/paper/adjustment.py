@@ -167,8 +167,7 @@ def adjust_frame(
     views: Callable[[int], View], ids: Sequence[int], poses: Array, fields: Array, classes: int, unit: float,
     constants: Constants = PAPER,
 ) -> Array:  # fmt: skip
-    """Return the pose (4, 4) of the last of the frames `ids`, which is no keyframe, after a local adjustment beside the
-    keyframes before it, which stay."""
+    """Return the pose (4, 4) of the last of the frames `ids` after a local adjustment beside keyframes, which stay."""
     moves = np.arange(len(ids)) == len(ids) - 1
     return local_adjustment(views, ids, poses, fields, moves, moves, classes, unit, constants)[0][-1]
 
