@@ -5,7 +5,7 @@ import hashlib
 import os
 import platform
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -116,12 +116,6 @@ def write_text(path: Path, text: str) -> None:
     """Write a UTF-8 text file atomically, line ends as they are; names that are no UTF-8 are escaped. Raises InputError
     as `atomic_path` does."""
     write_bytes(path, text.encode("utf-8", "backslashreplace"))
-
-
-def write_lines(path: Path, lines: Iterable[str]) -> None:
-    """A UTF-8 text file of these lines, of which one is in memory at a time, atomically."""
-    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-        file.writelines(f"{line}\n" for line in lines)
 
 
 def copy_file(source: Path, target: Path) -> None:

@@ -1,25 +1,23 @@
-"""COLMAP models: written in the format every version and every splatting trainer reads, read by pycolmap.
-
-pycolmap 4.2's own writers report no error on a full disk and leave truncated files, so writing is ours.
-"""
+"""COLMAP models: where a project has them, whether they are whole, read and written by pycolmap."""
 
 from __future__ import annotations
 
+import errno
+import os
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .atomic import write_bytes, write_lines, write_text
-from .colmap_files import model_suffix, names_in_text, require_whole_files
+from .atomic import atomic_path, explained
 from .errors import InputError
-from .ply import slices
-from .reading import opened, parsing, require_file
+from .reading import noting_files, opened, parsing, read_bytes, require_file
 from .trajectory import FARTHEST, nearest_rotation, poses_from_quaternions
 
 if TYPE_CHECKING:
@@ -27,10 +25,18 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_PINHOLE_MODEL_ID = 1
+_PARTS = ("cameras", "images", "points3D")
+_MODEL_PLACES = ("sparse", "colmap/sparse", ".")
+"""Where a project keeps its models, each in a folder of its own or one without."""
 _CAMERA_ID = 1
-_POINT2D = np.dtype([("xy", "<f8", 2), ("point3D_id", "<u8")])
-_TRACK_ELEMENT = np.dtype([("image_id", "<u4"), ("point2D_idx", "<u4")])
+
+# Parameters of each of COLMAP's camera models, in the order of the models' ids (SIMPLE_PINHOLE first).
+_PARAMETER_COUNTS = dict(enumerate((3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)))
+_CAMERA_HEAD_BYTES = 4 + 4 + 8 + 8
+_IMAGE_HEAD_BYTES = 4 + 7 * 8 + 4
+_POINT_HEAD_BYTES = 8 + 3 * 8 + 3 + 8
+_POINT2D_BYTES = 8 + 8 + 8
+_TRACK_ELEMENT_BYTES = 4 + 4
 
 
 @dataclass(frozen=True)
@@ -51,29 +57,6 @@ class ColmapModel:
     obs_image: NDArray[np.int64]
     obs_point: NDArray[np.int64]
     obs_xy: NDArray[np.float64]
-
-
-def write_colmap_model(folder: Path, model: ColmapModel) -> None:
-    """Write cameras, images and points3D, binary and text, of images by one PINHOLE camera.
-
-    Ids in the files count from 1, in the order given. Each point's error is the mean reprojection error of its
-    observations, -1 without any. COLMAP's text format has no way to write blanks in a name: such names are whole in
-    the binary files only.
-
-    Raises ValueError for shapes or indices that do not fit together, InputError when the disk refuses.
-    """
-    _require_consistent(model)
-    camera, errors, images = _camera(model), _point_errors(model), _Images.from_model(model)
-    tracks = _tracks(images, len(model.points))
-    points = (model.points, model.colors, errors, tracks)
-    folder = Path(folder)
-    # Binary last: readers look for it first, and must not find it before the rest is there.
-    write_text(folder / "cameras.txt", _cameras_text(camera))
-    write_lines(folder / "images.txt", _images_text(images))
-    write_lines(folder / "points3D.txt", _points_text(*points))
-    write_bytes(folder / "cameras.bin", _cameras_binary(camera))
-    write_bytes(folder / "images.bin", _images_binary(images))
-    write_bytes(folder / "points3D.bin", _points_binary(*points))
 
 
 def read_colmap_model(folder: Path) -> ColmapModel:
@@ -135,7 +118,7 @@ def _load(folder: Path) -> Any:
             f"no complete COLMAP model in {folder}: expected cameras, images and points3D as .bin or as .txt "
             "(look in sparse/0)"
         )
-    for part in ("cameras", "images", "points3D"):
+    for part in _PARTS:
         # COLMAP's recipe for known poses begins with an empty points3D.txt.
         with opened(folder / f"{part}{suffix}", any_content=(part, suffix) == ("points3D", ".txt")):
             pass
@@ -154,134 +137,77 @@ def _load(folder: Path) -> Any:
     return reconstruction
 
 
-@dataclass(frozen=True)
-class _Images:
-    """What images.* holds: per image a name, a pose, and the slice starts[i]:starts[i+1] of the observations."""
+def write_colmap_model(folder: Path, model: ColmapModel) -> None:
+    """Write cameras, images and points3D, binary and text, of images by one PINHOLE camera.
 
-    names: tuple[str, ...]
-    quat_wxyz: NDArray[np.float64]
-    translations: NDArray[np.float64]
-    starts: NDArray[np.int64]
-    obs_point: NDArray[np.int64]
-    obs_xy: NDArray[np.float64]
+    Ids in the files count from 1, in the order given. Each point's error is the mean reprojection error of its
+    observations, -1 without any. COLMAP's text format has no way to write blanks in a name: such names are whole in
+    the binary files only.
 
-    @staticmethod
-    def from_model(m: ColmapModel) -> _Images:
-        from scipy.spatial.transform import Rotation
-
-        order = np.argsort(m.obs_image, kind="stable")
-        starts = np.searchsorted(m.obs_image[order], np.arange(len(m.names) + 1)).astype(np.int64)
-        rotations = nearest_rotation(m.cam_from_world[:, :3, :3])
-        quat_xyzw = Rotation.from_matrix(rotations).as_quat(canonical=True) if len(m.names) else np.zeros((0, 4))
-        quat_wxyz, translations = quat_xyzw[:, [3, 0, 1, 2]], m.cam_from_world[:, :3, 3]
-        return _Images(tuple(m.names), quat_wxyz, translations, starts, m.obs_point[order], m.obs_xy[order])
-
-
-@dataclass(frozen=True)
-class _Tracks:
-    """Per point the slice starts[p]:starts[p+1] of (image_id, point2D_idx)."""
-
-    starts: NDArray[np.int64]
-    elements: NDArray
+    Raises ValueError for shapes or indices that do not fit together, InputError when the disk refuses.
+    """
+    _require_consistent(model)
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=folder) as made:
+            reconstruction = _reconstruction(model)
+            reconstruction.write_text(made)
+            reconstruction.write_binary(made)
+            _require_written(Path(made), model)
+            # Binary last: readers look for it first, and must not find it before the rest is there.
+            for name in (f"{part}{suffix}" for suffix in (".txt", ".bin") for part in _PARTS):
+                with atomic_path(folder / name) as temporary:
+                    os.replace(Path(made, name), temporary)
+    except OSError as error:
+        raise explained(error, folder / "images.bin") from error
 
 
-def _tracks(images: _Images, point_count: int) -> _Tracks:
-    counts = np.diff(images.starts)
-    elements = np.empty(len(images.obs_point), dtype=_TRACK_ELEMENT)
-    elements["image_id"] = np.repeat(np.arange(1, len(counts) + 1), counts)
-    elements["point2D_idx"] = np.arange(len(images.obs_point)) - np.repeat(images.starts[:-1], counts)
-    order = np.argsort(images.obs_point, kind="stable")
-    starts = np.searchsorted(images.obs_point[order], np.arange(point_count + 1)).astype(np.int64)
-    return _Tracks(starts, elements[order])
+def _reconstruction(m: ColmapModel) -> pycolmap.Reconstruction:
+    import pycolmap
+    from scipy.spatial.transform import Rotation
+
+    ((kind, width, height, params),) = m.cameras
+    made = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model=kind, width=width, height=height, params=params, camera_id=_CAMERA_ID)
+    made.add_camera_with_trivial_rig(camera)
+    order = np.argsort(m.obs_image, kind="stable")
+    starts = np.searchsorted(m.obs_image[order], np.arange(len(m.names) + 1))
+    for i, rows in enumerate(order[a:b] for a, b in pairwise(starts)):
+        rotation = Rotation.from_matrix(nearest_rotation(m.cam_from_world[i, :3, :3])).as_quat(canonical=True)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), m.cam_from_world[i, :3, 3])
+        image = pycolmap.Image(name=m.names[i], keypoints=m.obs_xy[rows], camera_id=_CAMERA_ID, image_id=i + 1)
+        made.add_image_with_trivial_frame(image, pose)
+    features = np.empty(len(order), np.int64)
+    features[order] = np.arange(len(order)) - starts[m.obs_image[order]]
+    order = order[np.argsort(m.obs_point[order], kind="stable")]
+    ends = np.searchsorted(m.obs_point[order], np.arange(len(m.points) + 1))
+    for point, rows in enumerate(order[a:b] for a, b in pairwise(ends)):
+        seen = zip((m.obs_image[rows] + 1).tolist(), features[rows].tolist(), strict=True)
+        track = pycolmap.Track([pycolmap.TrackElement(image_id, k) for image_id, k in seen])
+        made.add_point3D(m.points[point], track, m.colors[point])
+    made.update_point_3d_errors()
+    for number in np.flatnonzero(np.diff(ends) == 0).tolist():
+        made.points3D[number + 1].error = -1
+    return made
 
 
-def _camera(model: ColmapModel) -> tuple[int, int, float, float, float, float]:
-    """Width, height, fx, fy, cx, cy of its one camera."""
-    ((kind, width, height, parameters),) = model.cameras
-    fx, fy, cx, cy = parameters
-    if kind != "PINHOLE":
-        raise ValueError(f"write_colmap_model: got a camera of the model {kind}, expected PINHOLE")
-    return width, height, fx, fy, cx, cy
-
-
-def _point_errors(model: ColmapModel) -> NDArray[np.float64]:
-    """(P,) mean reprojection error in pixels, -1 for a point without observations, as COLMAP has it."""
-    _, _, fx, fy, cx, cy = _camera(model)
-    points, obs_point, obs_xy = model.points, model.obs_point, model.obs_xy
-    distance = np.zeros(len(obs_xy))
-    for rows in slices(len(obs_xy)):  # a pose for each observation is the largest thing here
-        transforms = model.cam_from_world[model.obs_image[rows]]
-        in_cam = np.einsum("oij,oj->oi", transforms[:, :3, :3], points[obs_point[rows]]) + transforms[:, :3, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            projected = in_cam[:, :2] / in_cam[:, 2:] * [fx, fy] + [cx, cy]
-        distance[rows] = np.nan_to_num(np.linalg.norm(projected - obs_xy[rows], axis=1), nan=0.0, posinf=0.0)
-    counts = np.bincount(obs_point, minlength=len(points))
-    total = np.bincount(obs_point, distance, minlength=len(points))
-    return np.where(counts > 0, total / np.maximum(counts, 1), -1.0)
-
-
-def _cameras_text(camera: tuple[int, int, float, float, float, float]) -> str:
-    width, height, *parameters = camera
-    head = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
-    return f"{head}{_CAMERA_ID} PINHOLE {width} {height} {_numbers(parameters)}\n"
-
-
-def _images_text(images: _Images) -> Iterator[str]:
-    yield "# Image list with two lines of data per image:"
-    yield "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"
-    yield "#   POINTS2D[] as (X, Y, POINT3D_ID)"
-    for i, name in enumerate(images.names):
-        here = slice(images.starts[i], images.starts[i + 1])
-        pose = _numbers([*images.quat_wxyz[i], *images.translations[i]])
-        yield f"{i + 1} {pose} {_CAMERA_ID} {name}"
-        pairs = zip(images.obs_xy[here].tolist(), images.obs_point[here].tolist(), strict=True)
-        yield " ".join(f"{x!r} {y!r} {point + 1}" for (x, y), point in pairs)
-
-
-def _points_text(
-    points: NDArray[np.float64], colors: NDArray[np.uint8], errors: NDArray[np.float64], tracks: _Tracks
-) -> Iterator[str]:
-    yield "# 3D point list with one line of data per point:"
-    yield "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"
-    for p, (xyz, rgb) in enumerate(zip(points, colors, strict=True)):
-        elements = tracks.elements[tracks.starts[p] : tracks.starts[p + 1]].tolist()
-        track = " ".join(f"{image} {index}" for image, index in elements)
-        yield f"{p + 1} {_numbers(xyz)} {rgb[0]} {rgb[1]} {rgb[2]} {float(errors[p])!r} {track}".rstrip()
-
-
-def _cameras_binary(camera: tuple[int, int, float, float, float, float]) -> bytes:
-    width, height, *parameters = camera
-    return struct.pack("<QIiQQ4d", 1, _CAMERA_ID, _PINHOLE_MODEL_ID, width, height, *parameters)
-
-
-def _images_binary(images: _Images) -> bytes:
-    points2d = np.empty(len(images.obs_point), dtype=_POINT2D)
-    points2d["xy"] = images.obs_xy
-    points2d["point3D_id"] = images.obs_point + 1
-    parts = [struct.pack("<Q", len(images.names))]
-    for i, name in enumerate(images.names):
-        here = points2d[images.starts[i] : images.starts[i + 1]]
-        parts.append(struct.pack("<I7dI", i + 1, *images.quat_wxyz[i], *images.translations[i], _CAMERA_ID))
-        parts.append(name.encode("utf-8") + b"\0" + struct.pack("<Q", len(here)) + here.tobytes())
-    return b"".join(parts)
-
-
-def _points_binary(
-    points: NDArray[np.float64], colors: NDArray[np.uint8], errors: NDArray[np.float64], tracks: _Tracks
-) -> bytes:
-    parts = [struct.pack("<Q", len(points))]
-    for p in range(len(points)):
-        track = tracks.elements[tracks.starts[p] : tracks.starts[p + 1]]
-        parts.append(struct.pack("<Q3d3BdQ", p + 1, *points[p], *colors[p].tolist(), errors[p], len(track)))
-        parts.append(track.tobytes())
-    return b"".join(parts)
-
-
-def _numbers(values: list[float]) -> str:
-    return " ".join(repr(float(v)) for v in values)
+def _require_written(folder: Path, model: ColmapModel) -> None:
+    """pycolmap reports no error on a full disk, and leaves truncated files."""
+    lines = {"images.txt": 4 + 2 * len(model.names), "points3D.txt": 3 + len(model.points)}
+    try:
+        with noting_files():  # they are not what a stage was made from
+            require_whole_files(folder)
+        whole = all(sum(line[-1:] == b"\n" for line in (folder / n).open("rb")) == count for n, count in lines.items())
+    except InputError:
+        whole = False
+    if not whole:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _require_consistent(m: ColmapModel) -> None:
+    if [camera[0] for camera in m.cameras] != ["PINHOLE"]:
+        raise ValueError(f"write_colmap_model: got cameras {m.cameras}, expected one of the model PINHOLE")
     n, p, o = len(m.names), len(m.points), len(m.obs_image)
     shapes = {"cam_from_world": (n, 4, 4), "points": (p, 3), "colors": (p, 3), "obs_point": (o,), "obs_xy": (o, 2)}
     for what, expected in shapes.items():
@@ -365,3 +291,97 @@ def set_pose(model: pycolmap.Reconstruction, image_id: int, cam_from_world: Arra
     import pycolmap
 
     model.frames[model.images[image_id].frame_id].rig_from_world = pycolmap.Rigid3d(cam_from_world[:3])
+
+
+# files --------------------------------------------------------------------------------------------------------------
+
+
+def model_suffix(folder: Path) -> str | None:
+    """Return ".bin" or ".txt" when the folder holds a complete model of that kind, else None."""
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{part}{suffix}").is_file() for part in _PARTS):
+            return suffix
+    return None
+
+
+def find_models(path: Path) -> list[Path]:
+    """Return the folders of a project's models, that with most images first: a mapper leaves several where it could not
+    connect all images. Of a folder that is a model itself, that folder; [] without any."""
+    if model_suffix(path):
+        return [path]
+    for place in (path / name for name in _MODEL_PLACES):
+        inside = sorted(place.iterdir()) if place.is_dir() else []
+        found = [p for p in (place, *inside) if not p.name.startswith(".") and model_suffix(p)]
+        if found:
+            return sorted(found, key=_size_of_model, reverse=True)
+    return []
+
+
+def _size_of_model(folder: Path) -> int:
+    """How many images it has, by its own word; 0 where it is damaged."""
+    try:
+        if model_suffix(folder) == ".txt":
+            return len(names_in_text(folder / "images.txt"))
+        with opened(folder / "images.bin") as file:
+            return int.from_bytes(file.read(8), "little")
+    except InputError:
+        return 0
+
+
+def names_in_text(path: Path) -> dict[str, str]:
+    """Read the names in an images.txt by the images' ids, with their blanks: pycolmap reads a name up to its first."""
+    names = {}
+    with opened(path) as file:
+        lines = (line.strip() for line in file)
+        for line in lines:
+            if line and not line.startswith(b"#"):
+                words = line.split(maxsplit=9)
+                if len(words) == 10:
+                    names[words[0].decode("ascii", "replace")] = words[9].decode("utf-8", "surrogateescape")
+                next(lines, None)  # its observations
+    return names
+
+
+def require_whole_files(folder: Path) -> None:
+    """Walk through cameras.bin, images.bin and points3D.bin and check that each ends where its counts say.
+
+    pycolmap trusts the counts: it reads on past the end of a truncated file, into wrong cameras or into as much
+    memory as the machine has. Raises InputError naming the file.
+    """
+    for name, after in (("cameras", _after_camera), ("images", _after_image), ("points3D", _after_point)):
+        path = folder / f"{name}.bin"
+        data = read_bytes(path)
+        with parsing(path, "whole file of a COLMAP model"):
+            (count,), at = struct.unpack_from("<Q", data), 8
+            for _ in range(count):
+                at = after(data, at)
+            if at != len(data):
+                raise ValueError("it ends elsewhere than its counts say")
+
+
+def _after_camera(data: bytes, at: int) -> int:
+    (model,) = struct.unpack_from("<i", data, at + 4)
+    return at + _CAMERA_HEAD_BYTES + 8 * _PARAMETER_COUNTS[model]
+
+
+def _after_image(data: bytes, at: int) -> int:
+    at = data.index(b"\0", at + _IMAGE_HEAD_BYTES) + 1
+    (points,) = struct.unpack_from("<Q", data, at)
+    return at + 8 + _POINT2D_BYTES * int(points)
+
+
+def _after_point(data: bytes, at: int) -> int:
+    (track,) = struct.unpack_from("<Q", data, at + _POINT_HEAD_BYTES)
+    return at + _POINT_HEAD_BYTES + 8 + _TRACK_ELEMENT_BYTES * int(track)
+
+
+def cameras_in(data: bytes) -> Iterator[tuple[int, int, int, int, tuple[float, ...]]]:
+    """Read id, number of the model, width, height and parameters of each camera of a cameras.bin. Raises struct.error
+    and KeyError for damage."""
+    (count,) = struct.unpack_from("<Q", data, 0)
+    at = 8
+    for _ in range(count):
+        head = struct.unpack_from("<IiQQ", data, at)
+        params = struct.unpack_from(f"<{_PARAMETER_COUNTS[head[1]]}d", data, at + _CAMERA_HEAD_BYTES)
+        at += _CAMERA_HEAD_BYTES + 8 * len(params)
+        yield *head, params

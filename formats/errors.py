@@ -1,9 +1,15 @@
-"""The one error a user is meant to read, and the commands that it names."""
+"""The one error a user is meant to read, and the commands that it names; warnings that say nothing to the user."""
 
 import importlib.metadata
 import importlib.util
 import shlex
 import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import Lock
+
+_FILTERS = Lock()
 
 
 class InputError(Exception):
@@ -49,3 +55,15 @@ def install_command(*requirements: str) -> str:
     python = shlex.quote(sys.executable)
     by = f"{python} -m pip install" if importlib.util.find_spec("pip") else f"uv pip install --python {python}"
     return " ".join([by, *map(shlex.quote, requirements)])
+
+
+@contextmanager
+def ignored_warnings(message: str = "", category: type[Warning] = Warning) -> Iterator[None]:
+    """Ignore warnings of a category whose text begins with a pattern, in this block.
+
+    The filters are the process's own: two threads that put back what each of them found would leave them changed, so
+    one block at a time does it. Keep it short.
+    """
+    with _FILTERS, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message, category)
+        yield

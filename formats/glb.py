@@ -1,17 +1,10 @@
-"""GLB: glTF's document and its one buffer in a file; and Gaussians in one by KHR_gaussian_splatting (Khronos).
-
-Of Gaussians it is a primitive of points whose attributes are POSITION and, prefixed with the extension's name, ROTATION
-(x y z w), SCALE (standard deviations), OPACITY (0..1) and SH_DEGREE_0_COEF_0 (colour = 0.5 + 0.2821 * it). COLOR_0 is
-for programs that do not know the extension: they show a cloud of coloured points. With
-KHR_gaussian_splatting_compression_spz_2 (Khronos, draft) the attributes are an SPZ file of version 2 in a buffer view:
-a tenth of the size, and all that CesiumJS draws.
-"""
+"""GLB: glTF's document and its one buffer in a file; labelled meshes in it, with vertex colours or with a texture."""
 
 from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -21,23 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .atomic import atomic_path
-from .gaussians import GaussianCloud
-from .ply import SH_C0
-from .spz import spz_bytes
+from .image_tags import light_of_srgb
+from .images import decode_rgb, jpeg_bytes
+from .ply import MeshBlocks
+from .reading import parsing, read_bytes
 
 _KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
-_BYTE, _FLOAT = 5121, 5126
-_COMPONENTS = {"|u1": _BYTE, "<u4": 5125, "<f4": _FLOAT}
+_COMPONENTS = {"|u1": 5121, "<u4": 5125, "<f4": 5126}
 _VERTICES, _INDICES = 34962, 34963
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
+_LINEAR, _MIPMAPPED, _CLAMPED = 9729, 9987, 33071
 UNLIT = "KHR_materials_unlit"
-EXTENSION = "KHR_gaussian_splatting"
-COMPRESSION = "KHR_gaussian_splatting_compression_spz_2"
 LABEL = "_LABEL"
 """Attribute of the class numbers."""
-_PROPERTIES = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-# glTF's y is up and its z comes towards the viewer; splats have x right, y down, z forward.
-_FLIP = np.array([1, -1, -1], dtype=np.float32)
 
 
 def material(unlit: bool = True, **more: Any) -> dict[str, Any]:
@@ -48,8 +37,7 @@ def material(unlit: bool = True, **more: Any) -> dict[str, Any]:
 
 def linear(colors: NDArray[Any]) -> NDArray[np.float32]:
     """Convert sRGB colours in 0..1 to linear light, as glTF wants COLOR_0 (2.0, 3.9.2); beyond 0..1 they are cut."""
-    srgb = np.clip(colors, 0, 1).astype(np.float32)
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    return light_of_srgb(np.clip(colors, 0, 1).astype(np.float32))
 
 
 @dataclass(frozen=True)
@@ -77,6 +65,12 @@ class Part:
             more |= {"min": kept.min(axis=0).tolist(), "max": kept.max(axis=0).tolist()}
         return Part(name, len(kept), kept[:1].size, kept.dtype.str, [kept], more)
 
+    def accessor(self) -> dict[str, Any]:
+        """Describe it for the document, but for its buffer view."""
+        return {
+            "componentType": _COMPONENTS[self.dtype], "count": self.count, "type": _KINDS[self.width], **self.more,
+        }  # fmt: skip
+
 
 def write_primitive(
     path: Path,
@@ -93,27 +87,45 @@ def write_primitive(
     ValueError where a part's blocks are not as long as it says, InputError when the disk refuses."""
     starts = np.cumsum([0, *(part.nbytes for part in parts), len(picture)]).tolist()
     views: list[dict[str, Any]] = [{"buffer": 0, "byteOffset": a, "byteLength": b - a} for a, b in pairwise(starts)]
-    accessors = []
-    for i, part in enumerate(parts):
-        views[i]["target"] = _VERTICES if part.name else _INDICES
-        head = {"bufferView": i, "componentType": _COMPONENTS[part.dtype], "count": part.count}
-        accessors.append({**head, "type": _KINDS[part.width], **part.more})
+    for view, part in zip(views, parts, strict=False):
+        view["target"] = _VERTICES if part.name else _INDICES
     attributes = {part.name: i for i, part in enumerate(parts) if part.name}
     indices = {"indices": len(attributes)} if len(attributes) < len(parts) else {}  # they are the last
     whole = {"attributes": attributes, **indices, **primitive}
-    document = {
+    document = glb_document(
+        {"extensionsUsed": list(extensions)} if extensions else {},
+        {"primitives": [whole], **name, "extras": {"classes": list(class_names)}},
+        name,
+        extras or {},
+        [{"bufferView": i, **part.accessor()} for i, part in enumerate(parts)],
+        views if picture else views[: len(parts)],
+        starts[-1],
+    )
+    write_glb(path, document, parts, picture)
+
+
+def glb_document(
+    extensions: dict[str, Any],
+    mesh: dict[str, Any],
+    node: dict[str, Any],
+    extras: dict[str, Any],
+    accessors: list[dict[str, Any]],
+    views: list[dict[str, Any]],
+    length: int,
+) -> dict[str, Any]:
+    """Return the document of a scene of one mesh in one node, over a buffer of `length` bytes."""
+    return {
         "asset": {"version": "2.0", "generator": "msgs-slam"},
-        **({"extensionsUsed": list(extensions)} if extensions else {}),
+        **extensions,
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, **name}],
-        "meshes": [{"primitives": [whole], **name, "extras": {"classes": list(class_names)}}],
-        **(extras or {}),
+        "nodes": [{"mesh": 0, **node}],
+        "meshes": [mesh],
+        **extras,
         "accessors": accessors,
-        "bufferViews": views if picture else views[: len(parts)],
-        "buffers": [{"byteLength": starts[-1]}],
+        "bufferViews": views,
+        "buffers": [{"byteLength": length}],
     }
-    write_glb(path, document, parts, picture)
 
 
 def write_glb(path: Path, document: dict[str, Any], parts: Sequence[Part], rest: bytes = b"") -> None:
@@ -135,73 +147,104 @@ def write_glb(path: Path, document: dict[str, Any], parts: Sequence[Part], rest:
         file.write(rest + padding)
 
 
-def glb_parts(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Return the document and buffer of a file's bytes. Raises ValueError, or what comes of missing bytes and keys, for
-    another file."""
-    magic, version, _ = struct.unpack_from("<4sII", data)
-    if magic != b"glTF" or version != 2:
-        raise ValueError("it does not begin like a GLB of version 2")
-    length, kind = struct.unpack_from("<II", data, 12)
-    document = json.loads(data[20 : 20 + length])
-    after = 20 + length
-    binary_length, binary_kind = struct.unpack_from("<II", data, after)
-    if (kind, binary_kind) != (_JSON, _BINARY):
-        raise ValueError("its two parts are not the document and its bytes")
-    return document, data[after + 8 : after + 8 + binary_length]
+def write_mesh_glb(
+    path: Path, mesh: MeshBlocks, class_names: tuple[str, ...] = (), gltf_from_world: NDArray[np.float64] | None = None
+) -> None:
+    """Write an unlit GLB with vertex colours, the labels as vertex attribute _LABEL, class names in the mesh's extras.
+
+    gltf_from_world (3, 3) turns the vertices: glTF wants y up. Errors as `write_mesh_ply`, ValueError for no faces.
+    """
+    if not mesh.face_count:
+        raise ValueError("write_mesh_glb: glTF has no way to store a mesh without faces")
+    turn = np.eye(3) if gltf_from_world is None else gltf_from_world.T
+
+    def positions() -> Iterator[NDArray[np.float32]]:
+        return ((points @ turn).astype(np.float32) for points, _, _ in mesh.vertices() if len(points))
+
+    ends = np.array([(points.min(0), points.max(0)) for points in positions()])
+    box = {"min": ends[:, 0].min(0).tolist(), "max": ends[:, 1].max(0).tolist()}
+    colors = (linear(colors / 255) for _, colors, _ in mesh.vertices())
+    parts = [
+        Part("POSITION", mesh.vertex_count, 3, "<f4", positions(), box),
+        Part("COLOR_0", mesh.vertex_count, 3, "<f4", colors),
+        # glTF wants every vertex at a multiple of 4 bytes: a float per label instead of a byte
+        Part(LABEL, mesh.vertex_count, 1, "<f4", (labels for _, _, labels in mesh.vertices())),
+        Part("", 3 * mesh.face_count, 1, "<u4", mesh.faces()),
+    ]
+    primitive, extras = {"mode": 4, "material": 0}, {"materials": [material()]}
+    write_primitive(path, parts, primitive, class_names, {"name": "mesh"}, extras, [UNLIT])
 
 
-def write_gaussian_glb(path: Path, cloud: GaussianCloud, class_names: tuple[str, ...] = ()) -> None:
-    """Write a cloud, its class numbers as attribute _LABEL and their names in the mesh's extras.
+@dataclass(frozen=True, eq=False)
+class TexturedMesh:
+    """vertices (V, 3) float32, labels (V,) uint8 (255 = no class), texture (H, W, 3) uint8.
 
-    The cloud has x right, y down, z forward, as from a splat PLY; the file's y is up. Nothing is rounded. The same
-    cloud gives the same bytes. Raises ValueError for an empty cloud, which glTF cannot hold, InputError when the disk
+    corner_vertex (K,) int64 and corner_uv (K, 2) float32: a vertex has as many corners as charts meet there; u to the
+    right and v downwards from the texture's top left, 0..1. faces (F, 3) int32 are corners.
+    """
+
+    vertices: NDArray[np.float32]
+    labels: NDArray[np.uint8]
+    corner_vertex: NDArray[np.int64]
+    corner_uv: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    texture: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        v, k = len(self.vertices), len(self.corner_vertex)
+        expected = {"vertices": (v, 3), "labels": (v,), "corner_uv": (k, 2), "faces": (len(self.faces), 3)}
+        for name, shape in expected.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"TexturedMesh: {name}: got shape {getattr(self, name).shape}, expected {shape}")
+        if not len(self.faces):
+            raise ValueError("TexturedMesh: it has no faces")
+        for name, indices, most in (("corner", self.faces, k), ("vertex", self.corner_vertex, v)):
+            if not 0 <= indices.min() <= indices.max() < most:
+                raise ValueError(f"TexturedMesh: a {name} is outside the {most} there are")
+
+
+def write_textured_glb(path: Path, mesh: TexturedMesh, class_names: tuple[str, ...] = ()) -> None:
+    """Write a GLB with the texture as a JPEG, shown as it is (KHR_materials_unlit), labels as attribute _LABEL.
+
+    glTF wants y up: the caller turns the vertices. The same mesh gives the same bytes. Raises InputError when the disk
     refuses.
     """
-    if len(cloud) == 0:
-        raise ValueError("write_gaussian_glb: glTF has no way to store an empty cloud")
-    opacity = (1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))).astype(np.float32)
-    arrays: dict[str, NDArray[Any]] = {
-        "POSITION": cloud.means * _FLIP,
-        "COLOR_0": np.column_stack([linear(cloud.colors), opacity]),
-        f"{EXTENSION}:ROTATION": cloud.quat_wxyz[:, [1, 2, 3, 0]] * np.append(_FLIP, np.float32(1)),
-        f"{EXTENSION}:SCALE": np.exp(cloud.log_scales),
-        f"{EXTENSION}:OPACITY": opacity,
-        f"{EXTENSION}:SH_DEGREE_0_COEF_0": (cloud.colors - np.float32(0.5)) / np.float32(SH_C0),
+    parts = [
+        Part.of("POSITION", mesh.vertices[mesh.corner_vertex]),
+        Part.of("TEXCOORD_0", mesh.corner_uv),
+        Part.of(LABEL, mesh.labels[mesh.corner_vertex].astype(np.float32)),
+        Part.of("", mesh.faces.reshape(-1).astype(np.uint32)),
+    ]
+    extras = {
+        "materials": [material(baseColorTexture={"index": 0})],
+        "textures": [{"source": 0, "sampler": 0}],
+        "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPPED, "wrapS": _CLAMPED, "wrapT": _CLAMPED}],
+        "images": [{"bufferView": len(parts), "mimeType": "image/jpeg"}],
     }
-    if cloud.class_ids is not None:
-        arrays[LABEL] = cloud.class_ids.astype(np.float32)
-    parts = [Part.of(name, array) for name, array in arrays.items()]
-    primitive = {"mode": 0, "material": 0, "extensions": {EXTENSION: _PROPERTIES}}
-    write_primitive(path, parts, primitive, class_names, {}, {"materials": [material()]}, [EXTENSION, UNLIT])
+    picture = jpeg_bytes(mesh.texture)
+    write_primitive(path, parts, {"material": 0}, class_names, {"name": "mesh"}, extras, [UNLIT], picture)
 
 
-def write_compressed_glb(path: Path, cloud: GaussianCloud) -> None:
-    """Write a cloud's colours as `write_gaussian_glb` does, compressed: rounded as SPZ rounds, without classes.
+def read_textured_glb(path: Path) -> TexturedMesh | None:
+    """Read a mesh by `write_textured_glb`, every corner a vertex of its own; None where it has no texture, as those by
+    `write_mesh_glb`. Raises InputError for another file."""
+    data = read_bytes(path)
+    with parsing(path, "mesh", "export it again"):
+        document, binary = _document_and_buffer(data)
+        if "textures" not in document:
+            return None
+        parts = [binary[v["byteOffset"] : v["byteOffset"] + v["byteLength"]] for v in document["bufferViews"]]
+        places, uv, labels = (np.frombuffer(part, "<f4") for part in parts[:3])
+        faces = np.frombuffer(parts[3], "<u4").reshape(-1, 3).astype(np.int32)
+        own = np.arange(len(labels))
+        picture = decode_rgb(parts[4], str(path))
+        return TexturedMesh(places.reshape(-1, 3), labels.astype(np.uint8), own, uv.reshape(-1, 2), faces, picture)
 
-    Raises ValueError for an empty cloud or places that SPZ cannot hold, InputError when the disk refuses.
-    """
-    if len(cloud) == 0:
-        raise ValueError("write_compressed_glb: glTF has no way to store an empty cloud")
-    packed, means = spz_bytes(cloud, 2), cloud.means * _FLIP
-    floats: dict[str, Any] = {"componentType": _FLOAT, "count": len(cloud)}
-    accessors = {
-        "POSITION": {**floats, "type": "VEC3", "min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()},
-        "COLOR_0": {**floats, "type": "VEC4", "componentType": _BYTE, "normalized": True},
-        f"{EXTENSION}:SCALE": {**floats, "type": "VEC3"},
-        f"{EXTENSION}:ROTATION": {**floats, "type": "VEC4"},
-    }
-    properties = {**_PROPERTIES, "extensions": {COMPRESSION: {"bufferView": 0}}}
-    attributes = {name: number for number, name in enumerate(accessors)}
-    document = {
-        "asset": {"version": "2.0", "generator": "msgs-slam"},
-        "extensionsUsed": [EXTENSION, COMPRESSION],
-        "extensionsRequired": [EXTENSION, COMPRESSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"mode": 0, "attributes": attributes, "extensions": {EXTENSION: properties}}]}],
-        "accessors": list(accessors.values()),
-        "bufferViews": [{"buffer": 0, "byteLength": len(packed)}],
-        "buffers": [{"byteLength": len(packed)}],
-    }
-    write_glb(path, document, [], packed)
+
+def _document_and_buffer(data: bytes) -> tuple[dict[str, Any], bytes]:
+    magic, version, _, length, kind = struct.unpack_from("<4s4I", data)
+    after = 20 + length
+    binary_length, binary_kind = struct.unpack_from("<II", data, after)
+    if (magic, version, kind, binary_kind) != (b"glTF", 2, _JSON, _BINARY):
+        raise ValueError("it is no GLB of version 2, of a document and its bytes")
+    return json.loads(data[20:after]), data[after + 8 : after + 8 + binary_length]

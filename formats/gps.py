@@ -14,14 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
+from .image_folder import match_names
 from .images import exif_gps
-from .names import match_names
 from .reading import parsing, read_bytes
 from .textfile import fields_of
 
 Array = NDArray[np.float64]
 
 _Texts = tuple[str | None, str | None, str | None, str | None]
+"""Of a row: time or name, latitude, longitude, altitude."""
 
 _MAX_TRACK_BYTES = 200_000_000
 _DEEPEST = 64
@@ -85,14 +86,15 @@ def read_track(path: Path) -> Track:
     Rows that are no fix are left out and counted, and of fixes of one time all but one. Raises InputError when the file
     is missing, damaged, of another kind, has fewer than two fixes, or more rows that are none.
     """
-    data = read_bytes(path, _MAX_TRACK_BYTES)
+    data, named = read_bytes(path, _MAX_TRACK_BYTES), False
     with parsing(path, "GPS track (GPX, or CSV with the columns time, lat, lon)"):
         if data[:100].lstrip(_BEFORE_XML).startswith(b"<"):
             texts = _gpx_rows(data)
         else:
             text = data.decode("utf-8-sig", errors="replace")
-            texts = list(_subtitle_rows(text)) if path.suffix.lower() == ".srt" else _table_rows(text, path)
-    rows = [row for row in map(_fix, texts) if row is not None]
+            is_subtitles = path.suffix.lower() == ".srt"
+            named, texts = (False, list(_subtitle_rows(text))) if is_subtitles else _table_rows(text, path)
+    rows = [row for text in texts if (row := _fix(text, named)) is not None]
     lost = len(texts) - len(rows)
     if len(rows) < 2 or lost > len(rows):
         raise InputError(
@@ -100,28 +102,22 @@ def read_track(path: Path) -> Track:
             "latitude and longitude: give the right file"
         )
     values = np.array([row[1:] for row in rows], np.float64)
-    if isinstance(rows[0][0], str):
+    if named:
         return Track(np.zeros(0), values[:, :2], values[:, 2], lost, tuple(str(row[0]) for row in rows))
     times, first = np.unique(np.array([row[0] for row in rows], np.float64), return_index=True)
     return Track(times, values[first, :2], values[first, 2], lost)
 
 
-def _fix(row: _Texts) -> tuple[float | str, float, float, float] | None:
+def _fix(row: _Texts, named: bool) -> tuple[float | str, float, float, float] | None:
     """Time or name, latitude, longitude, altitude; None where the texts are none."""
     try:
-        when = row[0] if isinstance(row[0], _Name) else _seconds(row[0] or "")
+        when: float | str = row[0] or "" if named else _seconds(row[0] or "")
         lat, lon = float(row[1] or ""), float(row[2] or "")
         altitude = float(row[3]) if row[3] and row[3].strip() else math.nan
     except ValueError:
         return None
     is_known = isinstance(when, str) or math.isfinite(when)
     return (when, lat, lon, altitude) if is_known and abs(lat) <= 90 and abs(lon) <= 180 else None
-
-
-class _Name(str):
-    """An image's name where other tables have a time."""
-
-    __slots__ = ()
 
 
 def _gpx_rows(data: bytes) -> list[_Texts]:
@@ -166,15 +162,13 @@ def _subtitle_rows(text: str) -> Iterator[_Texts]:
             yield time, stated["latitude"], stated.get("longitude", stated.get("longtitude")), height
 
 
-def _table_rows(text: str, path: Path) -> list[_Texts]:
+def _table_rows(text: str, path: Path) -> tuple[bool, list[_Texts]]:
+    """Whether rows have the names of images in place of times, and the rows."""
     table = fields_of(text, path)
     name, time, lat, lon, alt = (table.column(*names) for names in _COLUMNS)
-    if lat is None and lon is None and "".join(table.headings).startswith(_SYSTEMS):
-        if "".join(table.headings) not in _DEGREES:
-            raise InputError(
-                f"{path} is no GPS track in degrees: its first line names another system of coordinates: convert it to "
-                "EPSG:4326"
-            )
+    if lat is None and lon is None and (system := "".join(table.headings)).startswith(_SYSTEMS):
+        if system not in _DEGREES:
+            raise InputError(f"{path} is no GPS track in degrees but in another system: convert it to EPSG:4326")
         name, lon, lat, alt = 0, 1, 2, 3
     key = time if name is None else name
     if key is None or lat is None or lon is None:
@@ -182,12 +176,9 @@ def _table_rows(text: str, path: Path) -> list[_Texts]:
             f"{path} is no GPS track that can be read: its headings are {', '.join(table.headings) or 'missing'}; time "
             "(or the image's name), lat and lon are needed"
         )
-
-    def field(row: list[str], column: int | None) -> str | None:
-        return row[column] if column is not None and column < len(row) else None
-
-    kind = str if name is None else _Name
-    return [(kind(field(row, key) or ""), field(row, lat), field(row, lon), field(row, alt)) for row in table.rows]
+    columns = [key, lat, lon, alt]
+    rows = [[row[c] if c is not None and c < len(row) else None for c in columns] for row in table.rows]
+    return name is not None, [(when, *place) for when, *place in rows]  # type: ignore[misc]
 
 
 _COLUMNS = (

@@ -1,27 +1,26 @@
-"""The images of a folder: which they are, their order, and when they were taken."""
+"""The images of a folder: which they are, their order, when they were taken; and files by names that other programs
+have for them."""
 
+import os
+import posixpath
 import re
-from collections import Counter
-from collections.abc import Collection
-from pathlib import Path
+import unicodedata
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
 from .images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, VIDEO_SUFFIXES, exif_time, is_depth_map, read_rgb
-from .names import match_names
-from .reading import reaching
+from .reading import reaching, resolve_within
 from .textfile import is_number, read_rows
 
-_SIGNS = (
-    "accelerometer.txt", "calib.txt", "cam_params.json", "camera.json", "classes.json", "depth", "depth.txt", "depths",
-    "groundtruth.txt", "intrinsics.json", "label", "labels", "poses.txt", "semantic", "sensor.yaml", "sparse",
-    "traj.txt", "trajectory.txt", "transforms.json",
-)  # fmt: skip
-"""What makes the folder above images a data set: times in another are notes of any kind."""
 _MOST_DIGITS = 18
-_IMAGE_FOLDERS = ("rgb", "images", "color", "frames", "data", "image_0", "image_2")
+Listed = dict[Path, dict[str, list[str]]]
+"""What is in folders, by its `folded` names."""
 _LIST_NAMES = ("timestamps.txt", "times.txt", "rgb.txt")
 
 
@@ -47,38 +46,24 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(images, key=lambda p: natural_key(p.name))
 
 
-def unread_images(folder: Path) -> list[Path]:
-    """List the images directly in `folder` of a format that is not read, in natural order; those that lie there under
-    the same name in one that is read (a camera's raw file beside its JPEG) are not missed."""
-    with reaching(folder):
-        files = [p for p in folder.iterdir() if not p.name.startswith(".") and p.is_file()]
-    read = {p.stem.lower() for p in files if p.suffix.lower() in IMAGE_SUFFIXES}
-    unread = [p for p in files if p.suffix.lower() in UNREAD_SUFFIXES and p.stem.lower() not in read]
-    return sorted(unread, key=lambda p: natural_key(p.name))
-
-
 def count_images(folder: Path) -> int:
     """Count the image files directly in a folder, hidden ones left out; 0 where there is no such folder."""
-    try:
-        names = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
-        return sum(p.is_file() for p in names)
-    except OSError:  # none, no folder, or none that may be read
-        return 0
+    return sum(p.suffix.lower() in IMAGE_SUFFIXES and p.is_file() for p in _visible(folder))
 
 
 def hint_at_inner_folder(folder: Path, least: int = 2) -> str:
     """Name the folder in `folder`, or in one of its folders, with the most images; "" where none has `least`."""
-    inside = _folders_in(folder)
-    everywhere = [*inside, *(deeper for outer in inside for deeper in _folders_in(outer))]
-    counts = {p.relative_to(folder).as_posix(): count_images(p) for p in everywhere}
+    inside = [p for p in _visible(folder) if p.is_dir()]
+    inside += [deeper for outer in inside for deeper in _visible(outer) if deeper.is_dir()]
+    counts = {p.relative_to(folder).as_posix(): count_images(p) for p in inside}
     name = max(counts, key=counts.__getitem__, default="")
     return f"the folder {name}/ in it holds {counts[name]} images: give that" if counts.get(name, 0) >= least else ""
 
 
-def _folders_in(folder: Path) -> list[Path]:
+def _visible(folder: Path) -> list[Path]:
     try:
-        return [p for p in sorted(folder.iterdir()) if p.is_dir() and not p.name.startswith(".")]
-    except OSError:  # none that may be read
+        return [p for p in sorted(folder.iterdir()) if not p.name.startswith(".")]
+    except OSError:  # no folder, or none that may be read
         return []
 
 
@@ -88,22 +73,26 @@ def unused_pictures(images: Collection[Path], others: Collection[Path | None] = 
 
     A raw file or a clip beside a photograph of the same name is the same shot.
     """
-    used, shots, found = {*images, *others}, {path.stem for path in images}, Counter[str]()
-    for path in (path for folder in {path.parent for path in images} for path in folder.iterdir()):
+    used, shots, unnamed = {*images, *others}, {path.stem.lower() for path in images}, 0
+    unread: list[Path] = []
+    for path in (path for folder in sorted({path.parent for path in images}) for path in folder.iterdir()):
         kind = path.suffix.lower()
         if path in used or path.name.startswith(".") or not path.is_file():
             continue
-        if kind in IMAGE_SUFFIXES and not is_depth_map(path):
-            found["images"] += 1
-        elif kind in UNREAD_SUFFIXES | VIDEO_SUFFIXES and path.stem not in shots:
-            found[kind] += 1
+        if kind in IMAGE_SUFFIXES:
+            unnamed += not is_depth_map(path)
+        elif kind in UNREAD_SUFFIXES | VIDEO_SUFFIXES and path.stem.lower() not in shots:
+            unread.append(path)
     notes = []
-    if more := found.pop("images", 0):
-        notes.append(f"{more} images beside the {len(images)} that are read are not named by the data set: left out")
-    if found:
-        kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(found.items()))
+    if unnamed:
+        notes.append(f"{unnamed} images beside the {len(images)} that are read are not named by the data set: left out")
+    if unread:
+        first = min(unread, key=lambda p: natural_key(p.name)).name
+        kinds = Counter(path.suffix.lower() for path in unread)
+        counts = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
         notes.append(
-            f"beside the {len(images)} images that are read are files of kinds that are not ({kinds}): left out"
+            f"{len(unread)} files of kinds that are not read ({counts}) are left out, {first} first: export images as "
+            "JPEG or PNG"
         )
     return tuple(notes)
 
@@ -124,15 +113,22 @@ def _why_no_images(folder: Path, files: list[Path]) -> str:
 def read_image_times(images: list[Path]) -> NDArray[np.float64] | None:
     """Read (N,) seconds at which the images were taken, strictly increasing; None where they are unknown.
 
-    Looks for timestamps.txt, times.txt or rgb.txt in the images' folder, then in the one above where that is a data
-    set: a number a line for each image in order, or for each frame number in the images' names; or lines of
+    Looks for timestamps.txt, times.txt or rgb.txt in the images' folder, then in the one above where it says a time for
+    each: a number a line for each image in order, or for each frame number in the images' names; or lines of
     `seconds name` or `name seconds`. Else EXIF. An image that cannot be read gets a time between its neighbours'.
     Raises InputError for a list that matches the images in none of these ways.
     """
     if not images:
         return None
     listed = times_file(images[0].parent)
-    return _from_exif(images) if listed is None else _require_increasing(_from_list(listed, images), listed)
+    if listed is None:
+        return _from_exif(images)
+    times = _from_list(listed, images)
+    if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise InputError(
+            f"{listed}: times must be finite and increase from image to image: sort it, or remove the file"
+        )
+    return times
 
 
 def times_file(folder: Path) -> Path | None:
@@ -140,22 +136,13 @@ def times_file(folder: Path) -> Path | None:
     with reaching(folder):
         if found := _list_in(folder):
             return found
-        above = folder.resolve().parent
-        found = _list_in(above)
-        is_theirs = found is not None and (
-            any((above / name).exists() for name in _SIGNS)
-            or (folder.name in _IMAGE_FOLDERS and _concerns(found, folder))
-        )
-        return found if is_theirs else None
-
-
-def _concerns(path: Path, folder: Path) -> bool:
-    """Whether a list states a time for each image of a folder."""
+        above = _list_in(folder.resolve().parent)
     try:
-        _from_list(path, list_images(folder))
+        if above is not None:
+            _from_list(above, list_images(folder))
     except InputError:
-        return False
-    return True
+        return None  # of something else
+    return above
 
 
 def _list_in(folder: Path) -> Path | None:
@@ -195,36 +182,17 @@ def _from_list(path: Path, images: list[Path]) -> NDArray[np.float64]:
     )
 
 
-def _require_increasing(times: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
-    if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise InputError(f"{path}: times must be finite and increase from image to image: sort it, or remove the file")
-    return times
-
-
-def _is_damaged(path: Path) -> bool:
-    """Whether an image with a whole header cannot be decoded."""
-    try:
-        read_rgb(path)
-    except InputError:
-        return True
-    return False
-
-
 def _from_exif(images: list[Path]) -> NDArray[np.float64] | None:
     """None where an image states no time, or times do not increase: cameras that write whole seconds say no order."""
     stored = np.full(len(images), np.nan)
-    readable = np.zeros(len(images), dtype=bool)
     for i, path in enumerate(images):
-        try:
+        with suppress(InputError):  # damaged: left out when it is read, whatever its time
             time = exif_time(path)
-        except InputError:
-            continue  # damaged: left out when it is read, whatever its time
-        if time is None and _is_damaged(path):
-            continue
-        if time is None:
-            return None
-        stored[i], readable[i] = time, True
-    known = np.flatnonzero(readable)
+            if time is None:
+                read_rgb(path)  # refuses one of which the header alone is whole
+                return None
+            stored[i] = time
+    known = np.flatnonzero(np.isfinite(stored))
     if not len(known) or (np.diff(stored[known]) <= 0).any():
         return None
     step = (stored[known[-1]] - stored[known[0]]) / max(known[-1] - known[0], 1) or 1.0
@@ -232,3 +200,106 @@ def _from_exif(images: list[Path]) -> NDArray[np.float64] | None:
     times = np.interp(index, known, stored[known])
     times += step * (np.minimum(index - known[0], 0) + np.maximum(index - known[-1], 0))
     return np.asarray(times - times[0])
+
+
+# Names as different programs spell them: in another Unicode normal form or case, with other folders or none, with
+# backslashes, with another suffix or none.
+
+
+def folded(text: str) -> str:
+    """Return a text that is the same for spellings which differ in case or in Unicode's normal form only."""
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", text).casefold())
+
+
+def path_parts(name: str) -> list[str]:
+    """Return folders and file name of a path of any system, without roots, drives, `.` and leading `..`."""
+    parts = posixpath.normpath(name.replace("\\", "/")).split("/")
+    return [part for part in parts if part not in ("", ".", "..") and not part.endswith(":")]
+
+
+def stem(name: str) -> str:
+    """Return a path's file name without its suffix."""
+    return PurePosixPath(name.replace("\\", "/")).stem
+
+
+def match_names(wanted: Sequence[str], having: Sequence[str]) -> list[int | None]:
+    """Find for each wanted path the index of the one that means the same file; None without any, or where several fit
+    alike.
+
+    File names must agree but for suffix, case and normal form. Of several, that with the longest common end of the
+    path is taken, then that with the same spelling. None of them is of two wanted paths.
+    """
+    index: dict[str, list[int]] = defaultdict(list)
+    for row, name in enumerate(having):
+        for key in _keys(name):
+            index[key].append(row)
+    best = [_best((*_likeness(name, having[k]), k) for key in _keys(name) for k in index[key]) for name in wanted]
+    claims: dict[int, list[tuple[int, ...]]] = defaultdict(list)
+    for i, found in enumerate(best):
+        if found is not None:
+            claims[found[-1]].append((*found[:-1], i))
+    owner = {row: found[-1] for row, several in claims.items() if (found := _best(several)) is not None}
+    return [None if f is None or owner.get(f[-1]) != i else f[-1] for i, f in enumerate(best)]
+
+
+def _keys(name: str) -> set[str]:
+    """A name may have lost its suffix, or what looks like one may be part of it."""
+    file = (path_parts(name) or [""])[-1]
+    return {folded(file), folded(stem(file))}
+
+
+def _best(found: Iterable[tuple[int, ...]]) -> tuple[int, ...] | None:
+    """The likest, None where two are: rows of a likeness and a number."""
+    ranked = sorted(set(found), reverse=True)
+    return ranked[0] if ranked and (len(ranked) == 1 or ranked[0][:-1] != ranked[1][:-1]) else None
+
+
+def _likeness(a: str, b: str) -> tuple[int, int, int]:
+    """Common folders at the end of two paths whose names agree, whether the suffix, and how far the spelling does."""
+    first, second = path_parts(a)[::-1], path_parts(b)[::-1]
+    common = exact = 0
+    for x, y in zip(first[1:], second[1:], strict=False):
+        if folded(x) != folded(y):
+            break
+        common += 1
+        exact += x == y
+    file, other = (first or [""])[0], (second or [""])[0]
+    return common, int(folded(Path(file).suffix) == folded(Path(other).suffix)), exact + (stem(file) == stem(other))
+
+
+def named_file(
+    places: Sequence[Path], name: str, named_by: Path, shorten: bool = True, listed: Listed | None = None
+) -> Path | None:
+    """Return the file in one of `places` with the path `name`, or its longest end that is there; None without even one
+    of the bare name.
+
+    For names written on another machine: absolute, with backslashes, seen from another folder, in another Unicode
+    normal form, or in another case where one file only fits. What is returned lies in one of `places`, whatever the
+    name. Without `shorten` only roots and leading `..` are left off. `listed` keeps the folders' contents from one call
+    to the next. Raises InputError for a name too long.
+    """
+    listed, parts = {} if listed is None else listed, path_parts(name)
+    for first in range(len(parts) if shorten else min(len(parts), 1)):
+        files = [resolve_within(place, "/".join(parts[first:]), named_by) for place in places]
+        if found := next((file for file in files if file.is_file()), None):
+            return found
+        alike = (_spelled(place, parts[first:], listed) for place in places)
+        if found := next((file for file in alike if file is not None), None):
+            return found
+    return None
+
+
+def _spelled(folder: Path, parts: Sequence[str], listed: Listed) -> Path | None:
+    """The only file below a folder whose path differs in case and normal form alone."""
+    for part in parts:
+        if folder not in listed:
+            inside: dict[str, list[str]] = {}
+            for entry in os.listdir(folder) if folder.is_dir() else ():
+                inside.setdefault(folded(entry), []).append(entry)
+            listed[folder] = inside
+        found = listed[folder].get(folded(part), [])
+        exact = [entry for entry in found if entry == part] or found
+        if len(exact) != 1:
+            return None
+        folder = folder / exact[0]
+    return folder if folder.is_file() else None

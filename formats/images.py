@@ -4,7 +4,6 @@ import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import IO, Any
 
@@ -13,28 +12,29 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, UnidentifiedImageError
 
+from . import image_tags as tags
 from .atomic import write_bytes
-from .colours import UnusableProfile, has_other_colours, in_srgb
-from .errors import InputError
-from .exif import ANTICLOCKWISE, QUARTER_TURNS, TURNS, ExifLens, lens_of, place_of
-from .quiet import ignored_warnings
+from .errors import InputError, ignored_warnings
+from .image_tags import ExifLens
 from .reading import opened, parsing, read_bytes
 
 MAX_IMAGE_PIXELS = 120_000_000
 """A larger image is refused by its header, before memory is spent on it (phones go to 108 million)."""
 
-IMAGE_SUFFIXES = frozenset(
-    {
-        ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif", ".hif", ".avif",
-    }
-)  # fmt: skip
-VIDEO_SUFFIXES = frozenset(
-    {
+IMAGE_SUFFIXES = frozenset((
+    ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif", ".hif", ".avif",
+))  # fmt: skip
+VIDEO_SUFFIXES = frozenset((
     ".264", ".265", ".360", ".3g2", ".3gp", ".asf", ".avi", ".divx", ".dv", ".flv", ".gif", ".h264", ".h265", ".hevc",
     ".insv", ".ivf", ".m2t", ".m2ts", ".m2v", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg",
     ".mts", ".mxf", ".nut", ".ogg", ".ogv", ".qt", ".sens", ".ts", ".videos", ".vob", ".webm", ".wmv", ".y4m",
-}
-)  # fmt: skip
+))  # fmt: skip
+UNREAD_SUFFIXES = frozenset((
+    ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".gpr", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf",
+    ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f",
+    ".jxl", ".jp2", ".j2k", ".jxr", ".exr", ".hdr", ".psd", ".tga", ".ppm", ".pgm", ".pnm",
+))  # fmt: skip
+"""Of images that are not read: raw sensor data and others."""
 _WHOLE_RANGE = 0.0, 65535.0
 _OPAQUE_FROM = 128
 """Of 255: a pixel that is less opaque shows mostly what is not in the image."""
@@ -44,27 +44,6 @@ _PLAIN_FORMATS = ("JPEG", "MPO", "PNG")
 _SEVERAL_IMAGES = ("TIFF", "WEBP", "PNG", "GIF")
 SRGB, OTHER, UNUSABLE = "sRGB", "by a profile", "by an unusable profile"
 _ADVICE = "copy it again or remove it"
-RAW_SUFFIXES = frozenset(
-    {
-        ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".gpr", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf",
-        ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f",
-    }
-)  # fmt: skip
-"""Of photos that are not read: raw sensor data."""
-UNREAD_SUFFIXES = RAW_SUFFIXES | {
-    ".jxl",
-    ".jp2",
-    ".j2k",
-    ".jxr",
-    ".exr",
-    ".hdr",
-    ".psd",
-    ".tga",
-    ".ppm",
-    ".pgm",
-    ".pnm",
-}
-"""Of all images that are not read."""
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -86,7 +65,7 @@ def is_depth_map(path: Path) -> bool:
     """Return whether the header says one channel of more than 8 bits; False for a file that cannot be read."""
     try:
         with _opened(Path(path)) as image:
-            return is_one_deep_channel(image)
+            return _is_one_deep_channel(image)
     except InputError:
         return False
 
@@ -98,7 +77,7 @@ def is_plain(path: Path) -> bool:
     Raises InputError as `read_rgb` does.
     """
     with _opened(Path(path)) as image:
-        if image.format not in _PLAIN_FORMATS or image.mode not in ("RGB", "L") or _orientation(image) != 1:
+        if image.format not in _PLAIN_FORMATS or image.mode not in ("RGB", "L") or tags.orientation_of(image) != 1:
             return False
         return _colours(image) == SRGB
 
@@ -125,34 +104,38 @@ def read_rgb(path: Path, reading: Reading = AS_STATED) -> NDArray[np.uint8]:
     Raises InputError for a missing, truncated, oversized or unreadable file.
     """
     with _opened(Path(path)) as image:
-        is_wide = reading.span is not None and is_deep_colour(image)  # first: asking a PNG for EXIF loads it
+        is_wide = reading.span is not None and _is_deep_colour(image)  # first: asking a PNG for EXIF loads it
         turn = _turn(image, reading)
         if is_wide and reading.span is not None:
             profile = image.info.get("icc_profile")
-            image = Image.fromarray(_scaled(decode_16_bits(read_bytes(Path(path))), reading.span))
+            image = Image.fromarray(_scaled(_decode_16_bits(read_bytes(Path(path))), reading.span))
             image.info["icc_profile"] = profile
         image.load()
-        return to_rgb8(image if turn is None else image.transpose(turn), reading.span)
+        return _to_rgb8(image if turn is None else image.transpose(turn), reading.span)
 
 
 def read_transparent(path: Path, reading: Reading = AS_STATED) -> NDArray[np.bool_] | None:
     """Read (H, W) pixels of `read_rgb` that are less than half opaque; None where all are opaque. Raises the same."""
     with _opened(Path(path)) as image:
-        if image.mode in ("RGB", "L") and "transparency" not in image.info:
+        if image.mode not in _ALPHA_MODES and "transparency" not in image.info:
             return None
         turn = _turn(image, reading)
         image.load()
-        return transparent_pixels(image if turn is None else image.transpose(turn))
+        turned = image if turn is None else image.transpose(turn)
+        if _is_one_deep_channel(turned) or (turned.mode not in _ALPHA_MODES and "transparency" not in turned.info):
+            return None
+        clear = np.asarray(turned.convert("RGBA").getchannel("A")) < _OPAQUE_FROM
+        return clear if clear.any() else None
 
 
 def read_deep(path: Path) -> NDArray | None:
     """Read (H, W) or (H, W, 3) values of more than 8 bits as stored; None for other images. Raises as `read_rgb`
     does."""
     with _opened(Path(path)) as image:
-        if is_deep_colour(image):
-            return decode_16_bits(read_bytes(Path(path)))
+        if _is_deep_colour(image):
+            return _decode_16_bits(read_bytes(Path(path)))
         image.load()
-        return deep_values(image)
+        return np.asarray(image) if _is_one_deep_channel(image) else None
 
 
 def read_depth_png(path: Path) -> NDArray[np.uint16]:
@@ -219,7 +202,7 @@ def decode_rgb(data: bytes, name: str) -> NDArray[np.uint8]:
     """Decode an image held in memory as `read_rgb` does; `name` is what errors call it."""
     with parsing(name, "image", _ADVICE), _quiet_open(io.BytesIO(data), name) as image:
         _require_sane_size(image, name)
-        return to_rgb8(image)
+        return _to_rgb8(image)
 
 
 @dataclass(frozen=True)
@@ -243,72 +226,43 @@ class Header:
 def read_header(path: Path) -> Header:
     """Read the header of an image. Raises InputError as `read_rgb` does."""
     with _opened(Path(path)) as image:
-        deep = is_one_deep_channel(image) or is_deep_colour(image)  # first: asking a PNG for EXIF loads it
-        lens = lens_of(_tags(image), _tags(image, ExifTags.IFD.Exif), image.size)
+        deep = _is_one_deep_channel(image) or _is_deep_colour(image)  # first: asking a PNG for EXIF loads it
+        lens = tags.lens_of(tags.tags_of(image), tags.tags_of(image, ExifTags.IFD.Exif), image.size)
         images = int(getattr(image, "n_frames", 1)) if image.format in _SEVERAL_IMAGES else 1
-        before = _turned_before(image)
+        before = tags.turned_before(image)
         stored = image.size[::-1] if before >= 5 else image.size
-        return Header(stored, _orientation(image) if before == 1 else before, lens, deep, images, _colours(image))
+        return Header(
+            stored, tags.orientation_of(image) if before == 1 else before, lens, deep, images, _colours(image)
+        )
 
 
 def exif_time(path: Path) -> float | None:
     """Return the seconds (of the camera's own clock, since 1970) when the image was taken, from EXIF; None when
     missing."""
     with _opened(Path(path)) as image:
-        tags = _tags(image, ExifTags.IFD.Exif)
-    text = tags.get(ExifTags.Base.DateTimeOriginal)
-    fraction = str(tags.get(ExifTags.Base.SubsecTimeOriginal, "")).strip("\0 ")
-    try:
-        moment = datetime.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S")
-    except ValueError:
-        return None
-    seconds = (moment - datetime(1970, 1, 1)).total_seconds()
-    return seconds + (float(f"0.{fraction}") if fraction.isdecimal() else 0.0)
+        return tags.time_of(tags.tags_of(image, ExifTags.IFD.Exif))
 
 
 def exif_gps(path: Path) -> tuple[float, float, float] | None:
     """Return (latitude, longitude, altitude) in degrees and metres that EXIF states; altitude NaN, all None where
     missing."""
     with _opened(Path(path)) as image:
-        tags = _tags(image, ExifTags.IFD.GPSInfo)
-    return place_of(tags)
+        return tags.place_of(tags.tags_of(image, ExifTags.IFD.GPSInfo))
 
 
 def _colours(image: Image.Image) -> str:
     try:
-        return OTHER if has_other_colours(image) else SRGB
-    except UnusableProfile:
+        return OTHER if tags.has_other_colours(image) else SRGB
+    except tags.UnusableProfile:
         return UNUSABLE
 
 
 def _turn(image: Image.Image, reading: Reading) -> Image.Transpose | None:
     """The turn from the image as Pillow decodes it to that of the rule; HEIF comes turned already."""
-    if reading.orientation is None or reading.orientation not in QUARTER_TURNS:
-        return TURNS[_orientation(image)]
-    done = QUARTER_TURNS.get(_turned_before(image), 0)
-    return ANTICLOCKWISE[(QUARTER_TURNS[reading.orientation] - done) % 4]
-
-
-def _turned_before(image: Image.Image) -> int:
-    """The orientation that has been applied by the decoder."""
-    value = image.info.get("original_orientation")
-    return value if isinstance(value, int) and value in TURNS else 1
-
-
-def _orientation(image: Image.Image) -> int:
-    """1 to 8 as EXIF defines them; 1 for every other value: text, lists, other numbers."""
-    value = _tags(image).get(ExifTags.Base.Orientation, 1)
-    return int(value) if isinstance(value, int | float) and value in TURNS else 1
-
-
-def _tags(image: Image.Image, ifd: int | None = None) -> dict[int, Any]:
-    """EXIF's tags, of one of its directories or the base ones; none where they are damaged, for the image may be whole
-    beside them."""
-    try:
-        exif = image.getexif()
-        return dict(exif if ifd is None else exif.get_ifd(ifd))
-    except Exception:  # Pillow raises whatever its parser meets
-        return {}
+    if reading.orientation is None or reading.orientation not in tags.QUARTER_TURNS:
+        return tags.TURNS[tags.orientation_of(image)]
+    done = tags.QUARTER_TURNS.get(tags.turned_before(image), 0)
+    return tags.ANTICLOCKWISE[(tags.QUARTER_TURNS[reading.orientation] - done) % 4]
 
 
 def _read_one_channel(path: Path, what: str) -> NDArray:
@@ -357,49 +311,29 @@ def _too_large(name: str, size: str = "") -> InputError:
     )
 
 
-def to_rgb8(image: Image.Image, span: tuple[float, float] | None = None) -> NDArray[np.uint8]:
-    """Return (H, W, 3) uint8 sRGB of a loaded image, by its colour profile; grey is tripled, alpha dropped.
-
-    `span`: the values of a deep image that become 0 and 255, by default those of 16 bits (of floats the image's own).
-    What is not finite becomes 0. Raises ValueError for a pixel format that has no conversion.
-    """
-    deep = deep_values(image) if span is not None or is_one_deep_channel(image) else None
-    if deep is not None:
-        scaled = _scaled(deep, _default_span(deep) if span is None else span)
-        return scaled if scaled.ndim == 3 else np.repeat(scaled[:, :, None], 3, axis=2)
-    return np.array(in_srgb(image), dtype=np.uint8)
+def _to_rgb8(image: Image.Image, span: tuple[float, float] | None = None) -> NDArray[np.uint8]:
+    """(H, W, 3) sRGB of a loaded image; `span`: the values of a deep one that become 0 and 255, by default those of 16
+    bits (of floats the image's own)."""
+    if not _is_one_deep_channel(image):
+        return np.array(tags.in_srgb(image), dtype=np.uint8)
+    values = np.asarray(image)
+    scaled = _scaled(values, _default_span(values) if span is None else span)
+    return np.repeat(scaled[:, :, None], 3, axis=2)
 
 
-def transparent_pixels(image: Image.Image) -> NDArray[np.bool_] | None:
-    """Return (H, W) pixels that are less than half opaque; None for a format without alpha, or an image that is opaque
-    everywhere."""
-    if is_one_deep_channel(image) or (image.mode not in _ALPHA_MODES and "transparency" not in image.info):
-        return None
-    alpha = np.asarray(image.convert("RGBA").getchannel("A"))
-    clear = alpha < _OPAQUE_FROM
-    return clear if clear.any() else None
-
-
-def is_one_deep_channel(image: Image.Image) -> bool:
-    """Return whether the pixels are one number of more than 8 bits."""
+def _is_one_deep_channel(image: Image.Image) -> bool:
     return image.mode.startswith("I") or image.mode == "F"
 
 
-def deep_values(image: Image.Image) -> NDArray | None:
-    """Return (H, W) of one deep channel, or (H, W, 3) of three of 16 bits; None for other formats."""
-    return np.asarray(image) if is_one_deep_channel(image) else None
-
-
-def is_deep_colour(image: Image.Image) -> bool:
-    """Return whether an unloaded PNG or TIFF stores three or four channels of 16 bits, of which Pillow keeps the high
-    bytes."""
+def _is_deep_colour(image: Image.Image) -> bool:
+    """Whether an unloaded PNG or TIFF stores three or four channels of 16 bits: Pillow keeps the high bytes."""
     return (
         image.format in ("PNG", "TIFF") and image.mode in ("RGB", "RGBA") and ";16" in str(getattr(image, "tile", ""))
     )
 
 
-def decode_16_bits(data: bytes) -> NDArray[np.uint16]:
-    """Return (H, W, 3) uint16 RGB of a PNG or TIFF, not turned. Raises ValueError where it cannot be decoded."""
+def _decode_16_bits(data: bytes) -> NDArray[np.uint16]:
+    """(H, W, 3) RGB of a PNG or TIFF, not turned."""
     found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if found is None or found.ndim != 3 or found.dtype != np.uint16:
         raise ValueError("its 16 bit channels cannot be decoded")

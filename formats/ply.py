@@ -1,8 +1,7 @@
-"""PLY files: tables written in blocks and read again, clouds of points, and Gaussians as the original 3D Gaussian
-splatting stores them (Kerbl et al. 2023)."""
+"""PLY files: tables that are written and read in blocks; clouds of points and labelled meshes in them."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,28 +11,19 @@ from numpy.typing import NDArray
 
 from .atomic import atomic_path
 from .errors import InputError
-from .gaussians import GaussianCloud
-from .reading import opened
-
-SH_C0 = 0.28209479177387814
-"""The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * f_dc."""
-
-_REST_COUNTS = {0: 0, 1: 9, 2: 24, 3: 45}
-_MEANS, _NORMALS, _DC = ["x", "y", "z"], ["nx", "ny", "nz"], ["f_dc_0", "f_dc_1", "f_dc_2"]
-_SCALES, _ROTATION = ["scale_0", "scale_1", "scale_2"], ["rot_0", "rot_1", "rot_2", "rot_3"]
-_PROB = "class_prob_"
-
-_VERTEX = np.dtype([
-    *((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")), *((name, "u1") for name in ("red", "green", "blue"))
-])  # fmt: skip
+from .reading import opened, parsing
+from .trajectory import FARTHEST
 
 _MAX_HEADER_BYTES = 1 << 20
 _ROWS = 1 << 18
 """That are written at once."""
-_NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"} | {
-    "f4": "float",
-    "f8": "double",
-}
+_NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float"}
+
+_PLACE, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
+_POINT = np.dtype([*((n, "<f4") for n in (*_PLACE, *_NORMAL)), *((n, "u1") for n in _COLOR)])
+_VERTEX = np.dtype([*((n, "<f4") for n in _PLACE), *((n, "u1") for n in (*_COLOR, "label"))])
+_FACE = np.dtype([("vertex_indices", "<i4", (3,))])
+_LISTED = np.dtype([("length", "u1"), *_FACE.descr])
 
 
 @dataclass(frozen=True)
@@ -70,39 +60,6 @@ def slices(count: int) -> Iterator[slice]:
     return (slice(start, min(start + _ROWS, count)) for start in range(0, count, _ROWS))
 
 
-def read_ply_rows(path: Path, elements: dict[str, np.dtype]) -> dict[str, Rows]:
-    """Open the elements of a PLY by `write_ply`; blocks are read lazily.
-
-    `elements`: all of them in their order, a list as its length and its values. Raises InputError for a file that is
-    missing or has others.
-    """
-    with opened(path) as file:
-        head = file.read(_MAX_HEADER_BYTES)
-    end = head.find(b"\nend_header\n") + len(b"\nend_header\n")
-    counts = {m[1].decode(): int(m[2]) for m in re.finditer(rb"^element (\w+) (\d+)$", head[:end], re.MULTILINE)}
-    rows = {}
-    for name, dtype in elements.items():
-        rows[name] = Rows(dtype, counts.get(name, 0), _Blocks(path, dtype, counts.get(name, 0), end))
-        end += dtype.itemsize * rows[name].count
-    if list(counts) != list(elements) or end != Path(path).stat().st_size:
-        raise InputError(f"{path} is not as this program writes it: export it again")
-    return rows
-
-
-@dataclass(frozen=True)
-class _Blocks:
-    path: Path
-    dtype: np.dtype
-    count: int
-    start: int
-
-    def __iter__(self) -> Iterator[NDArray[Any]]:
-        with opened(self.path) as file:
-            file.seek(self.start)
-            for rows in slices(self.count):
-                yield np.fromfile(file, self.dtype, rows.stop - rows.start)
-
-
 def _property_lines(dtype: np.dtype) -> list[str]:
     lines = []
     for name in dtype.names or ():
@@ -133,65 +90,105 @@ def write_point_ply(path: Path, points: NDArray[np.float64], colors: NDArray[np.
     """
     if points.shape != (len(colors), 3) or colors.shape != points.shape:
         raise ValueError(f"write_point_ply: got points {points.shape} and colors {colors.shape}, expected (P, 3) both")
-    write_ply(path, {"vertex": Rows(_VERTEX, len(points), _blocks(points, colors))}, [])
+    blocks = (_filled(_POINT, {_PLACE: points[rows], _COLOR: colors[rows]}) for rows in slices(len(points)))
+    write_ply(path, {"vertex": Rows(_POINT, len(points), blocks)}, [])
 
 
-def _blocks(points: NDArray[np.float64], colors: NDArray[np.uint8]) -> Iterator[NDArray[Any]]:
-    for rows in slices(len(points)):
-        block = np.zeros(len(points[rows]), _VERTEX)
-        for i, (axis, color) in enumerate((("x", "red"), ("y", "green"), ("z", "blue"))):
-            block[axis], block[color] = points[rows, i], colors[rows, i]
-        yield block
+def _filled(dtype: np.dtype, columns: dict[tuple[str, ...], NDArray[Any]]) -> NDArray[Any]:
+    """Rows with these columns (n, names), and zeros in the others."""
+    rows = np.zeros(len(next(iter(columns.values()))), dtype)
+    for names, values in columns.items():
+        for name, column in zip(names, values.T, strict=True):
+            rows[name] = column
+    return rows
 
 
-def write_gaussian_ply(
-    path: Path, cloud: GaussianCloud | Sequence[GaussianCloud], class_names: tuple[str, ...] = (), *, sh_degree: int = 0
-) -> None:
-    """Write a cloud, or the parts of one, so that splat viewers and trainers take it as their own.
+@dataclass(frozen=True, eq=False)
+class MeshArrays:
+    """vertices (V, 3) float32, faces (F, 3) int32, colors (V, 3) uint8, labels (V,) uint8 (255 = no class)."""
 
-    The properties are those of the original code in its order: x y z, nx ny nz (0), f_dc_0..2, f_rest_* (as many as
-    `sh_degree` has, all 0), opacity (logit), scale_0..2 (log), rot_0..3 (w x y z); after them class_id (uchar) and
-    class_prob_<number> (float) where the cloud has classes, of those that are anywhere above 0: tables of 100 classes
-    would otherwise fill most of the file with zeros. Degree 0, the default, is what the original writes when it
-    trains without view-dependent colour; 3 is for readers that insist on 45 of them. Class names go to comments.
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    colors: NDArray[np.uint8]
+    labels: NDArray[np.uint8]
 
-    Raises ValueError for another degree or a value that is not finite, InputError when the disk refuses.
+    def __post_init__(self) -> None:
+        v = len(self.vertices)
+        expected = {"vertices": (v, 3), "faces": (len(self.faces), 3), "colors": (v, 3), "labels": (v,)}
+        for name, shape in expected.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"MeshArrays: {name}: got shape {getattr(self, name).shape}, expected {shape}")
+        if len(self.faces) and not 0 <= self.faces.min() <= self.faces.max() < v:
+            raise ValueError(f"MeshArrays: a face points outside the {v} vertices")
+        if not (np.abs(self.vertices) < FARTHEST).all():
+            raise ValueError("MeshArrays: a vertex is not finite, or too far away")
+
+
+@dataclass(frozen=True)
+class MeshBlocks:
+    """A mesh of which only a part is in memory at a time. `vertices` and `faces` go over it anew whenever they are
+    called: blocks of positions (n, 3) float32, colors (n, 3) uint8, labels (n,) uint8; and of faces (n, 3) int32."""
+
+    vertex_count: int
+    face_count: int
+    vertices: Callable[[], Iterable[tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]]]
+    faces: Callable[[], Iterable[NDArray[np.int32]]]
+
+
+def write_mesh_ply(path: Path, mesh: MeshBlocks, class_names: tuple[str, ...] = ()) -> None:
+    """Write a binary PLY with x y z, red green blue and the extra property label (uchar) at each vertex.
+
+    Class names go to comments. Raises ValueError for blocks that do not fit, InputError when the disk refuses.
     """
-    if sh_degree not in _REST_COUNTS:
-        raise ValueError(f"write_gaussian_ply: sh_degree must be 0 to 3, got {sh_degree}")
-    fields = [*_MEANS, *_NORMALS, *_DC, *(f"f_rest_{i}" for i in range(_REST_COUNTS[sh_degree]))]
-    fields += ["opacity", *_SCALES, *_ROTATION]
-    dtype: list[tuple[str, str]] = [(name, "<f4") for name in fields]
-    parts, count, found = [cloud] if isinstance(cloud, GaussianCloud) else cloud, 0, set[int]()
-    for part in parts:
-        count += len(part)
-        if part.class_probs is not None:
-            found |= {i for i, of in enumerate(part.class_probs.T) if of.any()}
-    if parts[0].class_ids is not None:
-        dtype.append(("class_id", "u1"))
-    occurring = sorted(found)
-    dtype += [(f"{_PROB}{i}", "<f4") for i in occurring]
-    blocks = (_rows(part, rows, np.dtype(dtype), occurring) for part in parts for rows in slices(len(part)))
-    comments = [f"class {i} {name}" for i, name in enumerate(class_names)]
-    write_ply(path, {"vertex": Rows(np.dtype(dtype), count, blocks)}, comments)
+    count, no_faces = mesh.vertex_count, np.zeros((0, 3), np.int32)
+    parts = (MeshArrays(points, no_faces, *rest) for points, *rest in mesh.vertices())
+    vertices = (_filled(_VERTEX, {_PLACE: m.vertices, _COLOR: m.colors, ("label",): m.labels[:, None]}) for m in parts)
+    elements = {
+        "vertex": Rows(_VERTEX, count, vertices),
+        "face": Rows(_FACE, mesh.face_count, (_face_rows(faces, count) for faces in mesh.faces())),
+    }
+    write_ply(path, elements, [f"class {i} {name}" for i, name in enumerate(class_names)])
 
 
-def _rows(cloud: GaussianCloud, rows: slice, dtype: np.dtype, occurring: list[int]) -> NDArray[Any]:
-    vertex = np.zeros(rows.stop - rows.start, dtype=dtype)
-    _fill(vertex, _MEANS, cloud.means[rows])
-    _fill(vertex, _DC, (cloud.colors[rows] - np.float32(0.5)) / np.float32(SH_C0))
-    _fill(vertex, ["opacity"], cloud.opacity_logits[rows, None])
-    _fill(vertex, _SCALES, cloud.log_scales[rows])
-    _fill(vertex, _ROTATION, cloud.quat_wxyz[rows])
-    if cloud.class_ids is not None:
-        vertex["class_id"] = cloud.class_ids[rows]
-    if cloud.class_probs is not None:
-        _fill(vertex, [f"{_PROB}{i}" for i in occurring], cloud.class_probs[rows][:, occurring])
-    return vertex
+def _face_rows(faces: NDArray[np.int32], count: int) -> NDArray[Any]:
+    if faces.shape[1:] != (3,) or (len(faces) and not 0 <= faces.min() <= faces.max() < count):
+        raise ValueError(f"MeshBlocks: a face is no triangle, or points outside the {count} vertices")
+    return np.ascontiguousarray(faces, "<i4").view(_FACE).reshape(-1)
 
 
-def _fill(vertex: NDArray[Any], names: list[str], values: NDArray[np.float32]) -> None:
-    if not np.isfinite(values).all():
-        raise ValueError(f"write_gaussian_ply: {names[0]} holds a value that is not finite")
-    for i, name in enumerate(names):
-        vertex[name] = values[:, i]
+def mesh_blocks(path: Path) -> MeshBlocks:
+    """Return the mesh of a PLY by `write_mesh_ply`; blocks are read lazily. Raises InputError for another file."""
+    with opened(path) as file:
+        head = file.read(_MAX_HEADER_BYTES)
+    start = head.find(b"\nend_header\n") + len(b"\nend_header\n")
+    counts = {m[1].decode(): int(m[2]) for m in re.finditer(rb"^element (\w+) (\d+)$", head[:start], re.MULTILINE)}
+    vertex_count, face_count = (counts.get(name, 0) for name in ("vertex", "face"))
+    faces_at = start + vertex_count * _VERTEX.itemsize
+    if list(counts) != ["vertex", "face"] or faces_at + face_count * _LISTED.itemsize != Path(path).stat().st_size:
+        raise InputError(f"{path} is not as this program writes it: export it again")
+
+    def blocks(dtype: np.dtype, at: int, count: int) -> Iterator[NDArray[Any]]:
+        with opened(path) as file:
+            file.seek(at)
+            for rows in slices(count):
+                yield np.fromfile(file, dtype, rows.stop - rows.start)
+
+    def vertices() -> Iterator[tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]]:
+        for rows in blocks(_VERTEX, start, vertex_count):
+            points, colors = (np.stack([rows[n] for n in names], 1) for names in (_PLACE, _COLOR))
+            yield points, colors, rows["label"].copy()
+
+    def faces() -> Iterator[NDArray[np.int32]]:
+        return (rows["vertex_indices"] for rows in blocks(_LISTED, faces_at, face_count))
+
+    return MeshBlocks(vertex_count, face_count, vertices, faces)
+
+
+def read_mesh_ply(path: Path) -> MeshArrays:
+    """Read a mesh by `write_mesh_ply`. Raises InputError for another file."""
+    mesh = mesh_blocks(path)
+    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8)
+    points, colors, labels = (np.concatenate(parts) for parts in zip(nothing, *mesh.vertices(), strict=True))
+    faces = np.concatenate([np.zeros((0, 3), np.int32), *mesh.faces()])
+    with parsing(path, "mesh", "export it again"):
+        return MeshArrays(points, faces, colors, labels)

@@ -9,7 +9,7 @@ import re
 import stat
 import time
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -17,7 +17,6 @@ from io import BufferedReader
 from pathlib import Path
 
 from .errors import InputError
-from .names import folded, path_parts
 
 LONGEST_NAME, _LONGEST_PATH = 255, 4000
 """Bytes that Linux takes for a part of a path, and a little less than it takes for the whole."""
@@ -33,8 +32,6 @@ _JUST_WRITTEN = 2.0
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
-Listed = dict[Path, dict[str, list[str]]]
-"""What is in folders, by its `folded` names."""
 _noted: ContextVar[tuple[Callable[[Path], None], ...]] = ContextVar("_noted", default=())
 
 
@@ -129,9 +126,7 @@ def opened(path: Path, limit: int | None = None, *, any_content: bool = False) -
     note_read(path)
     with file:
         with reaching(path):
-            _require_kind(path, file, limit)
-            if not any_content:
-                _require_content(path, file)
+            _require_regular(path, file, limit, any_content)
         try:
             yield file
         except OSError as error:
@@ -141,7 +136,7 @@ def opened(path: Path, limit: int | None = None, *, any_content: bool = False) -
             raise
 
 
-def _require_kind(path: Path, file: BufferedReader, limit: int | None) -> None:
+def _require_regular(path: Path, file: BufferedReader, limit: int | None, any_content: bool) -> None:
     status = os.fstat(file.fileno())
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path} is no regular file but a device, a pipe or a folder: give a file")
@@ -150,10 +145,9 @@ def _require_kind(path: Path, file: BufferedReader, limit: int | None) -> None:
             f"{path} is larger than expected ({status.st_size / 1e6:.0f} MB, at most {limit / 1e6:.0f}): is it another "
             "file's name?"
         )
-
-
-def _require_content(path: Path, file: BufferedReader) -> None:
-    if os.fstat(file.fileno()).st_size == 0:
+    if any_content:
+        return
+    if status.st_size == 0:
         raise InputError(f"{path} is empty (0 bytes): the copy or download did not finish, fetch it again")
     if file.read(len(_LFS_POINTER)) == _LFS_POINTER:
         raise InputError(f"{path} is a git-LFS pointer, not the file itself: run `git lfs pull` in its repository")
@@ -257,71 +251,22 @@ def links_in(folder: Path) -> Iterator[Path]:
         yield from (link for name in (*folders, *files) if (link := Path(path, name)).is_symlink())
 
 
-def named_file(
-    places: Sequence[Path], name: str, named_by: Path, shorten: bool = True, listed: Listed | None = None
-) -> Path | None:
-    """Return the file in one of `places` with the path `name`, or its longest end that is there; None without even one
-    of the bare name.
-
-    For names written on another machine: absolute, with backslashes, seen from another folder, in another Unicode
-    normal form, or in another case where one file only fits. What is returned lies in one of `places`, whatever the
-    name. Without `shorten` only roots and leading `..` are left off. `listed` keeps the folders' contents from one call
-    to the next. Raises InputError for a name too long.
-    """
-    listed, parts = {} if listed is None else listed, path_parts(name)
-    for first in range(len(parts) if shorten else min(len(parts), 1)):
-        files = [resolve_within(place, "/".join(parts[first:]), named_by) for place in places]
-        if found := next((file for file in files if file.is_file()), None):
-            return found
-        alike = (_spelled(place, parts[first:], listed) for place in places)
-        if found := next((file for file in alike if file is not None), None):
-            return found
-    return None
-
-
-def _spelled(folder: Path, parts: Sequence[str], listed: Listed) -> Path | None:
-    """The only file below a folder whose path differs in case and normal form alone."""
-    for part in parts:
-        if folder not in listed:
-            inside: dict[str, list[str]] = {}
-            for entry in os.listdir(folder) if folder.is_dir() else ():
-                inside.setdefault(folded(entry), []).append(entry)
-            listed[folder] = inside
-        found = listed[folder].get(folded(part), [])
-        exact = [entry for entry in found if entry == part] or found
-        if len(exact) != 1:
-            return None
-        folder = folder / exact[0]
-    return folder if folder.is_file() else None
-
-
 def file_sha256(path: Path) -> str:
     """Hex SHA-256 of a file's bytes. Raises InputError when it cannot be read."""
     with opened(path, any_content=True) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-_known_digests: dict[Path, tuple[tuple[int, ...], str]] = {}
+_known_digests: dict[Path, tuple[FileStamps, str]] = {}
 
 
 def known_sha256(path: Path) -> str:
     """Return `file_sha256`, taken once in this process for as long as the file's inode, size and times stay: videos are
     gigabytes. One that has just been written is read each time, for it may be written again at the same time of the
     clock."""
-    with reaching(path):
-        stamp = _stamp(path)
-    known = _known_digests.get(path)
-    if known is None or known[0] != stamp:
-        began, digest = time.time(), file_sha256(path)
-        if began - max(stamp[2:]) / 1e9 < _JUST_WRITTEN or _stamp(path) != stamp:
-            return digest
-        known = _known_digests[path] = (stamp, digest)
+    if (known := _known_digests.get(path)) is None or not known[0].are_current():
+        known = _known_digests[path] = (FileStamps.of([path]), file_sha256(path))
     return known[1]
-
-
-def _stamp(path: Path) -> tuple[int, ...]:
-    status = path.stat()
-    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 @dataclass(frozen=True)
@@ -347,6 +292,11 @@ class FileStamps:
             return self.stamps is not None and all(_stamp(path) == stamp for path, stamp in self.stamps.items())
         except OSError:
             return False
+
+
+def _stamp(path: Path) -> tuple[int, ...]:
+    status = path.stat()
+    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def files_sha256(

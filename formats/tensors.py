@@ -90,9 +90,26 @@ def _read_array(stream: IO[bytes], size: int) -> NDArray:
     return flat.reshape(shape[::-1]).T if is_fortran else flat.reshape(shape)
 
 
-def save_tensors(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
-    """Write a .safetensors file atomically; tensors are copied to the CPU. Raises InputError when the disk refuses."""
-    save_safetensors(path, {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()})
+def save_tensors(path: Path, tensors: Mapping[str, torch.Tensor | NDArray]) -> None:
+    """Write a .safetensors file atomically; tensors are copied to the CPU; the same ones give the same bytes. Raises
+    InputError when the disk refuses."""
+    # The library holds all of it in memory twice before it writes, which would be the peak memory of the mapping stage.
+    arrays = {
+        n: np.asarray(t if isinstance(t, np.ndarray) else t.detach().cpu(), order="C") for n, t in tensors.items()
+    }
+    names = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))  # so that each is aligned
+    header: dict[str, Any] = {}
+    end = 0
+    for name in names:
+        array, begin = arrays[name], end
+        end += array.nbytes
+        header[name] = {"dtype": _DTYPES[array.dtype.name], "shape": list(array.shape), "data_offsets": [begin, end]}
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text = text.ljust(-(-len(text) // 8) * 8)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        for name in names:
+            file.write(arrays[name].reshape(-1).view(np.uint8).data)
 
 
 def load_tensors(path: Path) -> dict[str, torch.Tensor]:
@@ -103,25 +120,3 @@ def load_tensors(path: Path) -> dict[str, torch.Tensor]:
     require_file(path)
     with parsing(path, ".safetensors file", "make it again"):
         return safetensors.torch.load_file(path)
-
-
-def save_safetensors(path: Path, arrays: Mapping[str, NDArray]) -> None:
-    """Write named arrays to a .safetensors file, atomically; the same arrays give the same bytes.
-
-    Raises InputError when the disk refuses.
-    """
-    # The library holds all of it in memory twice before it writes, which would be the peak memory of the mapping stage.
-    contiguous = {name: np.asarray(array, order="C") for name, array in arrays.items()}
-    names = sorted(contiguous, key=lambda name: (-contiguous[name].itemsize, name))  # so that each is aligned
-    header: dict[str, Any] = {}
-    end = 0
-    for name in names:
-        array, begin = contiguous[name], end
-        end += array.nbytes
-        header[name] = {"dtype": _DTYPES[array.dtype.name], "shape": list(array.shape), "data_offsets": [begin, end]}
-    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-    text = text.ljust(-(-len(text) // 8) * 8)
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write(len(text).to_bytes(8, "little") + text)
-        for name in names:
-            file.write(contiguous[name].reshape(-1).view(np.uint8).data)

@@ -7,6 +7,7 @@ import json
 import math
 import re
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -98,28 +99,23 @@ def fields_of(text: str, path: Path) -> Fields:
         names, rows = rows[0], rows[1:]
     elif not rows or len(names) != len(rows[0]) or any(map(is_number, names)):
         names = []
-    return Fields(tuple(map(_heading, names)), rows)
+    headings = (name.partition("[")[0].partition("(")[0].lower() for name in names)
+    return Fields(tuple(_PUNCTUATION.sub("", name) for name in headings), rows)
 
 
 def _divided(line: str, divider: str | None) -> list[str]:
     if divider is None or divider not in line:
         return line.split()
     fields = next(csv.reader([line], delimiter=divider, skipinitialspace=True)) if '"' in line else line.split(divider)
-    fields = [field.strip() if divider == "," else _plain_number(field.strip()) for field in fields]
+    fields = [field.strip() for field in fields]
+    if divider != ",":
+        fields = [f.replace(",", ".") if _DECIMAL_COMMA.fullmatch(f) else f for f in fields]
     while fields and not fields[-1]:
         fields.pop()
     words = [field.split() for field in fields]
     # Blanks may divide as well: 1 0 0, 0 1 0.
     mixed = any(len(part) > 1 and all(map(is_number, part)) for part in words)
     return [word for part in words for word in part] if mixed else fields
-
-
-def _plain_number(field: str) -> str:
-    return field.replace(",", ".") if _DECIMAL_COMMA.fullmatch(field) else field
-
-
-def _heading(text: str) -> str:
-    return _PUNCTUATION.sub("", text.partition("[")[0].partition("(")[0].lower())
 
 
 def read_rows(path: Path) -> list[list[str]]:
@@ -137,19 +133,24 @@ def is_number(field: str) -> bool:
 
 
 def read_table(path: Path, columns: int | None = None) -> NDArray[np.float64]:
-    """Read (rows, columns) float64 of a text table; with `columns` None, as many as the first row has.
-
-    Raises InputError that names the first row of another length or with a field that is no number.
-    """
+    """Read (rows, columns) float64 of a text table; with `columns` None, as many as the first row has. Raises
+    InputError for an empty file, and as `numbers_in`."""
     rows = read_rows(path)
     if not rows:
         raise InputError(f"{path} holds no numbers: check that it was written completely")
-    columns = columns or len(rows[0])
+    return numbers_in(rows, range(columns or len(rows[0])), path)
+
+
+def numbers_in(rows: list[list[str]], columns: Sequence[int], path: Path) -> NDArray[np.float64]:
+    """Return (N, len(columns)) of these columns. Raises InputError that names the first row which lacks one, or has a
+    field there that is no number."""
     for i, row in enumerate(rows):
-        if len(row) < columns:
-            raise InputError(f"{path}: row {i + 1} has {len(row)} numbers, expected {columns}: is the file cut short?")
+        if len(row) <= max(columns):
+            raise InputError(
+                f"{path}: row {i + 1} has {len(row)} numbers, expected {max(columns) + 1}: is the file cut short?"
+            )
     try:
-        return np.array([row[:columns] for row in rows], dtype=np.float64)
+        return np.array([[row[c] for c in columns] for row in rows], np.float64).reshape(len(rows), len(columns))
     except ValueError as error:
         raise InputError(f"{path}: {str(error)[:200]}: every field must be a number") from error
 
@@ -216,15 +217,11 @@ def _refuse(word: str) -> NoReturn:
 
 def _finite(digits: str) -> float:
     value = float(digits)
-    if not math.isfinite(value):
-        raise ValueError(f"the number {digits[:_MAX_DIGITS]} is too large")
-    return value
+    return value if math.isfinite(value) else _refuse(digits[:_MAX_DIGITS])
 
 
 def _integer(digits: str) -> int:
-    if len(digits) > _MAX_DIGITS:
-        raise ValueError(f"a number of {len(digits)} digits")
-    return int(digits)
+    return int(digits) if len(digits) <= _MAX_DIGITS else _refuse(f"one of {len(digits)} digits")
 
 
 def number(table: dict[str, Any], path: Path, *names: str) -> float:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from .atomic import write_text
 from .errors import InputError
-from .textfile import Fields, read_fields, read_rows, read_table
+from .textfile import Fields, numbers_in, read_fields, read_rows
 
 _ROTATION_TOLERANCE = 0.05
 """Largest departure of R^T R from the identity that is taken for rounding or drift rather than for another format."""
@@ -45,25 +45,6 @@ def nearest_rotation(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     return u @ vt
 
 
-def write_tum(path: Path, timestamps: NDArray[np.float64], world_from_cam: NDArray[np.float64], note: str = "") -> None:
-    """Write `timestamp tx ty tz qx qy qz qw` lines: camera centres and orientations in the world; `note` as comments.
-
-    timestamps (N,) seconds, world_from_cam (N, 4, 4). Raises ValueError for other shapes, InputError when the disk
-    refuses. The sign of a quaternion is chosen so that qw >= 0.
-    """
-    n = len(timestamps)
-    if world_from_cam.shape != (n, 4, 4):
-        raise ValueError(f"write_tum: got {n} timestamps and poses of shape {world_from_cam.shape}")
-    lines = [f"# {line}" for line in (*note.splitlines(), "timestamp tx ty tz qx qy qz qw")]
-    if n:
-        from scipy.spatial.transform import Rotation  # slow to import, and few files need it
-
-        quat_xyzw = Rotation.from_matrix(world_from_cam[:, :3, :3]).as_quat(canonical=True)
-        for time, t, q in zip(timestamps, world_from_cam[:, :3, 3], quat_xyzw, strict=True):
-            lines.append(f"{time:.9f} " + " ".join(f"{value:.9f}" for value in (*t, *q)))
-    write_text(path, "\n".join(lines) + "\n")
-
-
 def poses_from_quaternions(
     quat_xyzw: NDArray[np.float64], translations: NDArray[np.float64], name: str
 ) -> NDArray[np.float64]:
@@ -76,7 +57,11 @@ def poses_from_quaternions(
     length = np.linalg.norm(quat_xyzw, axis=1)
     bad = known & ~((np.abs(length - 1) <= _ROTATION_TOLERANCE) & _is_within_reach(translations))
     if bad.any():
-        raise _no_pose(quat_xyzw, translations, int(np.argmax(bad)), name)
+        row = int(np.argmax(bad))
+        raise InputError(
+            f"{name}: pose {row + 1} is no rigid transform (quaternion of length {length[row]:.3g}, position "
+            f"{np.array2string(translations[row], precision=3)}): remove it, or correct the order of the columns"
+        )
     poses = np.full((len(quat_xyzw), 4, 4), np.nan)
     if known.any():
         from scipy.spatial.transform import Rotation
@@ -87,30 +72,29 @@ def poses_from_quaternions(
     return poses
 
 
-def _no_pose(quat_xyzw: NDArray[np.float64], translations: NDArray[np.float64], row: int, name: str) -> InputError:
-    return InputError(
-        f"{name}: pose {row + 1} is no rigid transform (quaternion of length {np.linalg.norm(quat_xyzw[row]):.3g}, "
-        f"position {np.array2string(translations[row], precision=3)}): remove it, or correct the order of the columns"
-    )
-
-
 def _is_within_reach(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
     """(N,) whether each of (N, 3) is finite and within `FARTHEST`."""
     return np.asarray((np.abs(positions) <= FARTHEST).all(axis=1))
 
 
 @dataclass(frozen=True)
-class TimedPath:
-    """N poses of a text file: world_from_cam (N, 4, 4), NaN for rows without one; times (N,) in seconds and names (N)
-    of their images, None and () where the file has none; `is_counted`: the names are numbers of frames."""
+class PoseFile:
+    """N poses: world_from_cam (N, 4, 4), camera axes x right, y down, z forward; names (N) of their images, as
+    the file has them, () where it has none; times (N,) in seconds, None where it has none; `is_metric`: whether
+    files of its kind always are in metres; `lost`: how many poses of the file are not finite, and here NaN."""
 
+    kind: str
     world_from_cam: NDArray[np.float64]
-    times: NDArray[np.float64] | None = None
     names: tuple[str, ...] = ()
-    is_counted: bool = False
+    times: NDArray[np.float64] | None = None
+    is_metric: bool = False
+    lost: int = 0
+
+    def __len__(self) -> int:
+        return len(self.world_from_cam)
 
 
-def read_trajectory(path: Path) -> TimedPath:
+def read_trajectory(path: Path) -> PoseFile:
     """Read the poses of a text table: by its headings where they name position and quaternion, else TUM lines (with
     RTAB-Map's ninth column, the node's id, or without), or matrices as `read_matrices` does.
 
@@ -121,25 +105,28 @@ def read_trajectory(path: Path) -> TimedPath:
         raise InputError(f"{path} holds no numbers: check that it was written completely")
     width, chosen = len(table.rows[0]), _chosen_columns(table, path)
     if chosen is None and width not in (8, 9):
-        return TimedPath(read_matrices(path))
+        return PoseFile("a file of matrices", read_matrices(path))
     columns = chosen or list(range(1, 8))
-    if chosen is None:
-        _require_tum(table.rows, path)
-    values = _numbers(table.rows, columns, path)
+    for i, row in enumerate(table.rows if chosen is None else ()):
+        if len(row) not in (8, 9) or (len(row) == 9 and not row[8].isdecimal()):
+            raise InputError(f"{path}: row {i + 1} has {len(row)} numbers, a TUM trajectory has 8 (t, xyz, quat xyzw)")
+    values = numbers_in(table.rows, columns, path)
     poses = poses_from_quaternions(values[:, 3:], values[:, :3], str(path))
     if (named := table.column(*_NAME)) is not None:
-        return TimedPath(poses, names=tuple(row[named] for row in table.rows))
+        return PoseFile("a table of poses", poses, tuple(row[named] for row in table.rows))
     if (counted := table.column(*_COUNT)) is not None:
-        numbers = _numbers(table.rows, [counted], path)[:, 0]
+        numbers = numbers_in(table.rows, [counted], path)[:, 0]
         poses[~(np.abs(numbers) < _LARGEST_COUNT)] = np.nan
         names = tuple(f"{int(n):06d}" if abs(n) < _LARGEST_COUNT else f"row {k + 1}" for k, n in enumerate(numbers))
-        return TimedPath(poses, names=names, is_counted=True)
+        return PoseFile("Stray Scanner's poses", poses, names, is_metric=True)
     timed = table.column(*_TIME) if chosen else 0
     if timed is None:
-        return TimedPath(poses)
-    times = _in_seconds(_numbers(table.rows, [timed], path)[:, 0])
+        return PoseFile("a table of poses", poses)
+    times = numbers_in(table.rows, [timed], path)[:, 0]
+    largest = np.abs(times[np.isfinite(times)]).max(initial=0)  # tells milli-, micro- and nanoseconds since 1970
+    times *= next((unit for unit, least in ((1e-9, 1e17), (1e-6, 1e14), (1e-3, 1e11)) if largest > least), 1.0)
     poses[~np.isfinite(times)] = np.nan
-    return TimedPath(poses, times)
+    return PoseFile("a TUM trajectory", poses, times=times)
 
 
 def _chosen_columns(table: Fields, path: Path) -> list[int] | None:
@@ -159,32 +146,6 @@ def _chosen_columns(table: Fields, path: Path) -> list[int] | None:
     return None if missing else [column for column in found if column is not None]
 
 
-def _require_tum(rows: list[list[str]], path: Path) -> None:
-    for i, row in enumerate(rows):
-        if len(row) not in (8, 9) or (len(row) == 9 and not row[8].isdecimal()):
-            raise InputError(f"{path}: row {i + 1} has {len(row)} numbers, a TUM trajectory has 8 (t, xyz, quat xyzw)")
-
-
-def _numbers(rows: list[list[str]], columns: list[int], path: Path) -> NDArray[np.float64]:
-    """(N, len(columns)) of these columns. Raises InputError naming the row that lacks one."""
-    for i, row in enumerate(rows):
-        if len(row) <= max(columns):
-            raise InputError(
-                f"{path}: row {i + 1} has {len(row)} numbers, expected {max(columns) + 1}: is the file cut short?"
-            )
-    try:
-        return np.array([[row[c] for c in columns] for row in rows], np.float64).reshape(len(rows), len(columns))
-    except ValueError as error:
-        raise InputError(f"{path}: {str(error)[:200]}: every field must be a number") from error
-
-
-def _in_seconds(times: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Times that count milli-, micro- or nanoseconds since 1970, by their size."""
-    largest = np.abs(times[np.isfinite(times)]).max(initial=0)
-    unit = next((unit for unit, least in ((1e-9, 1e17), (1e-6, 1e14), (1e-3, 1e11)) if largest > least), 1.0)
-    return times * unit
-
-
 def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Read (N,) timestamps in file order and (N, 4, 4) world_from_cam of a TUM file, without rows that are not finite.
 
@@ -202,6 +163,25 @@ def read_tum(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return found.times[known], found.world_from_cam[known]
 
 
+def write_tum(path: Path, timestamps: NDArray[np.float64], world_from_cam: NDArray[np.float64], note: str = "") -> None:
+    """Write `timestamp tx ty tz qx qy qz qw` lines: camera centres and orientations in the world; `note` as comments.
+
+    timestamps (N,) seconds, world_from_cam (N, 4, 4). Raises ValueError for other shapes, InputError when the disk
+    refuses. The sign of a quaternion is chosen so that qw >= 0.
+    """
+    n = len(timestamps)
+    if world_from_cam.shape != (n, 4, 4):
+        raise ValueError(f"write_tum: got {n} timestamps and poses of shape {world_from_cam.shape}")
+    lines = [f"# {line}" for line in (*note.splitlines(), "timestamp tx ty tz qx qy qz qw")]
+    if n:
+        from scipy.spatial.transform import Rotation  # slow to import, and few files need it
+
+        quat_xyzw = Rotation.from_matrix(world_from_cam[:, :3, :3]).as_quat(canonical=True)
+        for time, t, q in zip(timestamps, world_from_cam[:, :3, 3], quat_xyzw, strict=True):
+            lines.append(f"{time:.9f} " + " ".join(f"{value:.9f}" for value in (*t, *q)))
+    write_text(path, "\n".join(lines) + "\n")
+
+
 def read_matrices(path: Path) -> NDArray[np.float64]:
     """Read (N, 4, 4) world_from_cam of a file of row-major matrices: 16 or 12 numbers a line, or 4 lines for each
     matrix.
@@ -211,16 +191,12 @@ def read_matrices(path: Path) -> NDArray[np.float64]:
     """
     rows = read_rows(path)
     width = len(rows[0]) if rows else 0
-    if width == 4 and len(rows) % 4 == 0:
-        stacked = read_table(path, 4).reshape(-1, 4, 4)
-    elif width == 16:
-        stacked = read_table(path, 16).reshape(-1, 4, 4)
-    elif width == 12:
-        top = read_table(path, 12).reshape(-1, 3, 4)
-        stacked = np.concatenate([top, np.tile([[[0.0, 0, 0, 1]]], (len(top), 1, 1))], axis=1)
-    else:
+    if width not in (4, 12, 16) or (width == 4 and len(rows) % 4):
         raise InputError(f"{path}: {len(rows)} rows of {width} numbers are no 4x4 matrices: expected 16, 12 or 4 x 4")
-    return clean_poses(stacked, str(path))
+    values = numbers_in(rows, range(width), path)
+    if width == 12:
+        values = np.hstack([values, np.tile([0.0, 0.0, 0.0, 1.0], (len(values), 1))])
+    return clean_poses(values.reshape(-1, 4, 4), str(path))
 
 
 def clean_poses(matrices: NDArray[np.float64], name: str) -> NDArray[np.float64]:

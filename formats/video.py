@@ -6,6 +6,7 @@ import itertools
 import math
 import os
 import shlex
+import statistics
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,14 +25,8 @@ import cv2
 from .errors import InputError, install_extra
 from .images import IMAGE_SUFFIXES
 from .reading import opened, require_unicode
-from .video_clock import Clock, longest_step
-from .video_head import VideoTrack, main_track, read_tracks
-from .video_streams import AvCapture, StreamFacts, as_opencv_writes_them, has_pyav, read_facts, unreadable
-
-_SQUARE = 0.002
-"""Sides that differ by less come from a size that was rounded to whole pixels."""
-_LONGEST_PIXEL = 5.0
-"""Length of a pixel's sides to each other; what is beyond is a damaged number."""
+from .video_head import Display, VideoTrack, main_track, mirror_of, pixel_aspect, read_tracks
+from .video_streams import AvCapture, has_pyav, interlaced_error, opencv_capture_options, read_facts
 
 MAX_FRAME_PIXELS = 64_000_000
 """A larger frame is taken for a damaged or hostile header (8K video has 33 million)."""
@@ -49,14 +44,9 @@ _FIRST_FRAMES = 8
 """Decoded before to see whether a video is interlaced."""
 _DOUBTED_FRAMES = 1000
 """Among so many, frames without a picture of their own are looked into."""
-_ARCHIVES = {
-    b"PK\3\4": "ZIP",
-    b"Rar!": "RAR",
-    b"7z\xbc\xaf": "7z",
-    b"\x1f\x8b": "gzip",
-    b"\xfd7zX": "xz",
-    b"BZh": "bzip2",
-}
+_SHORTEST_STEP = 1e-6
+_ARCHIVES = (b"PK\3\4", b"Rar!", b"7z\xbc\xaf", b"\x1f\x8b", b"\xfd7zX", b"BZh", b"\x28\xb5\x2f\xfd")
+_TAR, _TAR_MARK_AT = b"ustar", 257
 _CODECS = {"av01": "AV1", "vvc1": "H.266 (VVC)", "vvi1": "H.266 (VVC)", "apv1": "APV", "evc1": "EVC"}
 _DECODED = ("h264", "avc1", "hevc", "hev1", "hvc1", "mp4v", "mjpg", "vp80", "vp90", "vp09")
 """By every OpenCV: a file of these is damaged where it has no frame."""
@@ -92,7 +82,7 @@ def probe_video(path: Path) -> VideoInfo:
     with VideoReader(path) as reader:
         # Two frames: OpenCV makes the same picture of all frames that it cannot convert.
         if not list(itertools.islice(reader, 2)):
-            raise _blank(Path(path), reader.blank_frames) if reader.blank_frames else _undecodable(Path(path))
+            raise _undecodable(Path(path), blank=reader.blank_frames)
         return reader.info
 
 
@@ -107,8 +97,8 @@ class VideoReader(Iterator[VideoFrame]):
     Of `tracks` (of MP4 and Matroska) number `track` is read: without PyAV always the first, and `main_track` otherwise.
 
     After the end `timestamps` holds the time of every decoded frame and `missing_frames` how many frames the header
-    promised beyond those. `repaired_timestamps` counts the repairs, `restarts` the places where the stored clock begins
-    anew, `blank_frames` those wanted that show one flat colour and were left out (a fade, or a picture never decoded).
+    promised beyond those. `repaired_timestamps` counts the repairs, `blank_frames` those wanted
+    that show one flat colour and were left out (a fade, or a picture never decoded).
     `hdr` is "HLG" or "PQ" where the file says so, `tone_mapped` whether its frames are then brought to sRGB;
     `interlaced` whether frames are deinterlaced.
 
@@ -123,17 +113,16 @@ class VideoReader(Iterator[VideoFrame]):
         self.tracks = read_tracks(self._path)
         self.track = main_track(self.tracks) if has_pyav() else 0
         stated = self.tracks[self.track] if self.tracks else VideoTrack(0, 0)
-        facts = read_facts(self._path, _FIRST_FRAMES, self.track) if has_pyav() else StreamFacts()
+        self.interlaced, transfer = read_facts(self._path, _FIRST_FRAMES, self.track) if has_pyav() else (False, "")
         self.has_alpha = stated.has_alpha
-        self.hdr = stated.transfer or facts.transfer
+        self.hdr = stated.transfer or transfer
         self.tone_mapped = bool(self.hdr) and has_pyav()
-        self.interlaced = facts.is_interlaced
         self._capture = self._first_grabbed()
         self._is_grabbed = True
         self.display = _read_display(self._capture, stated)
         self.info = _read_info(self._capture, self._path, self.display, stated)
         self._has_counted = stated.samples > 0 or head.startswith(b"RIFF")
-        self._clock = Clock(self.info.fps, longest_step(head))
+        self._clock = Clock(self.info.fps)
         self._last: NDArray | None = None
         self._is_trusted = False
         self.ended = False
@@ -144,7 +133,7 @@ class VideoReader(Iterator[VideoFrame]):
         if self.tone_mapped or self.interlaced or self.track:
             by_pyav = AvCapture(self._path, self.hdr, self.interlaced, self.track)
             if self.interlaced and by_pyav.codec == "hevc":
-                raise unreadable(self._path, by_pyav.codec)
+                raise interlaced_error(self._path, by_pyav.codec)
             if by_pyav.isOpened() and by_pyav.grab():
                 return by_pyav
             raise _undecodable(self._path)
@@ -167,11 +156,6 @@ class VideoReader(Iterator[VideoFrame]):
         return self._clock.repairs
 
     @property
-    def restarts(self) -> int:
-        """Places where the stored clock begins anew or jumps, and goes on from there."""
-        return self._clock.restarts
-
-    @property
     def missing_frames(self) -> int:
         """Frames that the header claims and the file does not deliver; 0 before the end."""
         return max(0, self.info.frame_count_claimed - len(self._clock.times)) if self.ended else 0
@@ -183,8 +167,9 @@ class VideoReader(Iterator[VideoFrame]):
         Most containers state no number of frames but how long they last: then frames that go on to that end are all.
         """
         claimed = self.info.frame_count_claimed
-        if self.missing_frames <= max(2, claimed // 50) or self.restarts:
-            return False
+        few = max(2, claimed // 50)
+        if self.missing_frames <= few or few < self.repaired_timestamps < len(self._clock.times) - 1:
+            return False  # of recordings that were joined to one file the header says nothing
         return self._has_counted or self._clock.times[-1] < _WHOLE * (claimed - 1) / self.info.fps
 
     def __next__(self) -> VideoFrame:
@@ -215,8 +200,8 @@ class VideoReader(Iterator[VideoFrame]):
         if self._is_trusted or index > _DOUBTED_FRAMES or isinstance(self._capture, AvCapture):
             return
         self._is_trusted = True
-        if read_facts(self._path, index + 1).is_interlaced:
-            raise unreadable(self._path, _codec(self._capture), index)
+        if read_facts(self._path, index + 1)[0]:
+            raise interlaced_error(self._path, _codec(self._capture), index)
 
     def close(self) -> None:
         """Release the decoder; iterating further ends at once."""
@@ -243,9 +228,8 @@ def _read_video_bytes(path: Path) -> bytes:
         raise InputError(f"{path} is a single image, not a video: give the folder that contains the images")
     with opened(path) as file:
         head = file.read(_SNIFFED_BYTES)
-    archive = next((name for start, name in _ARCHIVES.items() if head.startswith(start)), None)
-    if archive is not None:
-        raise InputError(f"{path} is a {archive} archive, not a video: unpack it first, then give what was in it")
+    if head.startswith(_ARCHIVES) or head.startswith(_TAR, _TAR_MARK_AT):
+        raise InputError(f"{path} is an archive: unpack it first, then give the video or the folder that was in it")
     if b"\0" not in head and _is_text(head):
         raise InputError(f"{path} is a text file, not a video: give a video file or a folder that holds images")
     return head
@@ -264,7 +248,7 @@ def _open(path: Path) -> cv2.VideoCapture:
     require_unicode(path.resolve())  # OpenCV ends the whole process
     level, options = cv2.utils.logging.getLogLevel(), os.environ.get(_OPTIONS_VARIABLE)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    os.environ[_OPTIONS_VARIABLE] = as_opencv_writes_them()  # OpenCV has no other way to hand them to FFmpeg
+    os.environ[_OPTIONS_VARIABLE] = opencv_capture_options()  # OpenCV has no other way to hand them to FFmpeg
     try:
         # Without naming the backend, "img_01.jpg" would open as the start of a numbered image series.
         capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
@@ -284,27 +268,24 @@ def _codec(capture: cv2.VideoCapture | AvCapture) -> str:
     return letters.to_bytes(4, "little").decode("latin-1").strip("\0 ") if capture.isOpened() else ""
 
 
-def _undecodable(path: Path, codec: str = "") -> InputError:
-    file = shlex.quote(str(path))
+def _undecodable(path: Path, codec: str = "", blank: int = 0) -> InputError:
+    """That no image comes out; `blank`: so many, all of one flat colour, came out."""
+    convert = f"convert it with `ffmpeg -i {shlex.quote(str(path))} -c:v libx264 OUT.mp4`"
     if codec and codec.lower() not in _DECODED:
         name = _CODECS.get(codec.lower(), codec)
         more = "" if has_pyav() else f"; `{install_extra('hdr')}` brings more decoders"
         return InputError(
-            f"no image can be decoded from {path}: there is no decoder for its codec, {name}, "
-            f"or it is damaged: convert it with `ffmpeg -i {file} -c:v libx264 OUT.mp4`{more}"
+            f"no image can be decoded from {path}: there is no decoder for its codec, {name}, or it is damaged: "
+            f"{convert}{more}"
         )
-    return InputError(
-        f"no image can be decoded from {path}: it contains no video stream (audio only?), is damaged, or was not "
-        "copied completely: play it in a video player, and if it plays convert it with "
-        f"`ffmpeg -i {file} -c:v libx264 OUT.mp4`"
-    )
-
-
-def _blank(path: Path, count: int) -> InputError:
-    return InputError(
-        f"all {count} frames of {path} are of one flat colour (a covered lens, or not decoded properly): play it in a "
-        f"video player, and if it plays convert it with `ffmpeg -i {shlex.quote(str(path))} -c:v libx264 OUT.mp4`"
-    )
+    if blank:
+        what = f"all {blank} frames of {path} are of one flat colour (a covered lens, or not decoded properly)"
+    else:
+        what = (
+            f"no image can be decoded from {path}: it contains no video stream (audio only?), is damaged, or was not "
+            "copied completely"
+        )
+    return InputError(f"{what}: play it in a video player, and if it plays {convert}")
 
 
 def _is_blank(image: NDArray) -> bool:
@@ -347,51 +328,24 @@ def _as_rgb8(decoded: NDArray) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(decoded.astype(np.uint8, copy=False), to_rgb), dtype=np.uint8)
 
 
-@dataclass(frozen=True)
-class Display:
-    """Steps that are left to do after the decoder's turn, in this order: swap the axes, mirror left to right (-1) and
-    top to bottom, and lengthen pixels: `aspect` is their width by their height as they are then, 1 for squares."""
+class Clock:
+    """Container times made strictly increasing, with the first frame at 0: one that is missing or goes back is the
+    usual step after the last, as are all after the clock has begun anew, in recordings that were joined to one file."""
 
-    swaps: bool = False
-    mirror: tuple[int, int] = (1, 1)
-    aspect: float = 1.0
+    def __init__(self, fps: float) -> None:
+        self.times: list[float] = []
+        self.repairs = 0
+        self._start, self._nominal_step = 0.0, 1.0 / fps
 
-    @property
-    def is_mirrored(self) -> bool:
-        """Whether the file asks for a mirrored picture, which no turn gives."""
-        return self.swaps or self.mirror != (1, 1)
-
-    def size(self, width: int, height: int) -> tuple[int, int]:
-        """Return the width and height in which a decoded frame of that size is shown; none becomes less."""
-        width, height = (height, width) if self.swaps else (width, height)
-        if self.aspect >= 1:
-            return round(width * self.aspect), height
-        return width, round(height / self.aspect)
-
-    def shown(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return (H, W, ...) in the size that `size` says."""
-        size = self.size(image.shape[1], image.shape[0])
-        image = np.swapaxes(image, 0, 1) if self.swaps else image
-        image = np.ascontiguousarray(image[:: self.mirror[1], :: self.mirror[0]])
-        if size == (image.shape[1], image.shape[0]):
-            return image
-        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
-
-
-def mirror_of(matrix: tuple[int, int, int, int]) -> Display:
-    """Return the Display of a matrix (a, b, c, d; see `VideoTrack`) that mirrors the picture; one that leaves all as it
-    is where it only turns, which decoders do."""
-    a, b, c, d = matrix
-    if a * d - b * c >= 0:
-        return Display()
-    swaps = abs(a) < abs(b)
-    across, down = (c, b) if swaps else (a, d)
-    return Display(swaps, (1 if across > 0 else -1, 1 if down > 0 else -1))
-
-
-def pixel_aspect(wide: float, high: float) -> float:
-    """Return the width by height of a pixel; 1 where it is not said (0), damaged, or only rounding away from a
-    square."""
-    aspect = wide / high if wide > 0 and high > 0 else 1.0
-    is_square = abs(aspect - 1) < _SQUARE or not 1 / _LONGEST_PIXEL <= aspect <= _LONGEST_PIXEL
-    return 1.0 if is_square else aspect
+    def next(self, stored: float) -> float:
+        """Return the time of the next frame, given what the container says (any float, NaN and negative included)."""
+        if not self.times:
+            self._start = stored if math.isfinite(stored) else 0.0
+            self.times.append(0.0)
+        elif _SHORTEST_STEP < stored - self._start - self.times[-1] < math.inf:
+            self.times.append(stored - self._start)
+        else:
+            self.repairs += 1
+            steps = [b - a for a, b in itertools.pairwise(self.times[-16:])]
+            self.times.append(self.times[-1] + (statistics.median(steps) if steps else self._nominal_step))
+        return self.times[-1]

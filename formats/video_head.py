@@ -7,10 +7,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from .errors import InputError
-from .exif import plausible_equivalent, positive
+from .image_tags import plausible_equivalent, positive
 from .reading import parsing
 
 WHOLE, PART = "equirectangular", "part of a sphere"
@@ -30,6 +33,10 @@ _EQUIVALENT = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
 _TEXT, _FLOATS = 1, {23: ">f", 24: ">d"}
 """Types of a metadata value; others are whole numbers."""
 _IDENTITY = (1, 0, 0, 1)
+_SQUARE = 0.002
+"""Sides that differ by less come from a size that was rounded to whole pixels."""
+_LONGEST_PIXEL = 5.0
+"""Length of a pixel's sides to each other; what is beyond is a damaged number."""
 _WITH_ALPHA = 32
 """Bits of a pixel in a sample entry that has red, green, blue and alpha."""
 _EBML, _SEGMENT, _TRACKS, _TRACK = 0x1A45DFA3, 0x18538067, 0x1654AE6B, 0xAE
@@ -68,6 +75,56 @@ def main_track(tracks: list[VideoTrack]) -> int:
         key=lambda i: (tracks[i].samples != 1, tracks[i].is_default, tracks[i].width * tracks[i].height, -i),
         default=0,
     )
+
+
+@dataclass(frozen=True)
+class Display:
+    """Steps that are left to do after the decoder's turn, in this order: swap the axes, mirror left to right (-1) and
+    top to bottom, and lengthen pixels: `aspect` is their width by their height as they are then, 1 for squares."""
+
+    swaps: bool = False
+    mirror: tuple[int, int] = (1, 1)
+    aspect: float = 1.0
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether the file asks for a mirrored picture, which no turn gives."""
+        return self.swaps or self.mirror != (1, 1)
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """Return the width and height in which a decoded frame of that size is shown; none becomes less."""
+        width, height = (height, width) if self.swaps else (width, height)
+        if self.aspect >= 1:
+            return round(width * self.aspect), height
+        return width, round(height / self.aspect)
+
+    def shown(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return (H, W, ...) in the size that `size` says."""
+        size = self.size(image.shape[1], image.shape[0])
+        image = np.swapaxes(image, 0, 1) if self.swaps else image
+        image = np.ascontiguousarray(image[:: self.mirror[1], :: self.mirror[0]])
+        if size == (image.shape[1], image.shape[0]):
+            return image
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+
+
+def mirror_of(matrix: tuple[int, int, int, int]) -> Display:
+    """Return the Display of a matrix (a, b, c, d; see `VideoTrack`) that mirrors the picture; one that leaves all as it
+    is where it only turns, which decoders do."""
+    a, b, c, d = matrix
+    if a * d - b * c >= 0:
+        return Display()
+    swaps = abs(a) < abs(b)
+    across, down = (c, b) if swaps else (a, d)
+    return Display(swaps, (1 if across > 0 else -1, 1 if down > 0 else -1))
+
+
+def pixel_aspect(wide: float, high: float) -> float:
+    """Return the width by height of a pixel; 1 where it is not said (0), damaged, or only rounding away from a
+    square."""
+    aspect = wide / high if wide > 0 and high > 0 else 1.0
+    is_square = abs(aspect - 1) < _SQUARE or not 1 / _LONGEST_PIXEL <= aspect <= _LONGEST_PIXEL
+    return 1.0 if is_square else aspect
 
 
 # MP4 and MOV -----------------------------------------------------------------------------------------------------
@@ -244,10 +301,8 @@ def video_sphere(path: Path) -> str:
         is_whole = whole >= 0 and not any(moov[whole + 8 : whole + 24])
         eyes = moov.find(b"st3d")
         return WHOLE if is_whole and (eyes < 0 or moov[eyes + 8 : eyes + 9] in (b"", b"\0")) else PART
-    found = _PROJECTION.search(moov) if b"GSpherical" in moov else None
-    if found is None:
-        return ""
-    return WHOLE if found[1] == WHOLE.encode() and not _SECOND_EYE.search(moov) else PART
+    kind = _projection(moov) if b"GSpherical" in moov else ""
+    return PART if kind and _SECOND_EYE.search(moov) else kind
 
 
 def image_sphere(path: Path) -> str:
@@ -257,5 +312,9 @@ def image_sphere(path: Path) -> str:
             xmp = image.info.get("xmp", b"")
     except InputError:
         return ""
-    found = _PROJECTION.search(xmp if isinstance(xmp, bytes) else str(xmp).encode())
+    return _projection(xmp if isinstance(xmp, bytes) else str(xmp).encode())
+
+
+def _projection(xmp: bytes) -> str:
+    found = _PROJECTION.search(xmp)
     return "" if found is None else WHOLE if found[1] == WHOLE.encode() else PART

@@ -1,4 +1,5 @@
-"""Finding interlaced streams, and decoding by PyAV: what OpenCV does not do for a video.
+"""Finding interlaced streams, and decoding by PyAV: what OpenCV does not do for a video; and writing videos, with what
+OpenCV brings along, and for browsers by H.264 where PyAV is installed.
 
 PyAV reads HDR (HLG, PQ), which OpenCV's decoder cuts to 8 flat bits, codecs that OpenCV does not have, tracks behind
 the first, and interlaced video: each frame holds two fields (half pictures) of different times, or is one. OpenCV's
@@ -6,14 +7,16 @@ FFmpeg (from OpenCV 4.13 on) cannot convert such frames, and does not say so: it
 before, black, the last frame, or a picture of another video."""
 
 import contextlib
-import functools
+import errno
 import itertools
 import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +24,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .colours import RGB_FROM_2020, srgb_of
-from .errors import InputError, install_extra
+from .atomic import atomic_path, free_bytes, is_disk_full
+from .errors import DiskFullError, InputError, install_extra
+from .image_tags import tone_mapped
+from .reading import require_unicode
 from .video_head import TRANSFERS
 
 # The containers of one video each. Left out is what names other files (playlists, scripts, numbered images) or is made
@@ -43,8 +48,15 @@ _LISTEN = (
     "for _ in range(int(sys.argv[2])): capture.read()"
 )
 
-_KNEE = 0.75
-"""Up to this part of diffuse white light stays as it is; all that is brighter shares the rest."""
+
+H264, VP9, MPEG4 = "H.264", "VP9", "MPEG-4 part 2"
+PLAYED = (H264, VP9)
+"""By browsers."""
+_QUALITY = "18"
+"""x264's constant rate factor: hardly distinguishable from the images themselves."""
+
+CODECS = {".mp4": "mp4v", ".avi": "FFV1", ".mkv": "FFV1"}
+"""By the file's ending: MPEG-4 plays everywhere, FFV1 loses nothing."""
 
 
 class AvCapture:
@@ -168,33 +180,6 @@ def _through(graph: Any, frames: list[Any]) -> Iterator[Any]:
                 yield graph.pull()
 
 
-def tone_mapped(rgb: NDArray[np.uint16], transfer: str) -> NDArray[np.uint8]:
-    """Convert to (H, W, 3) sRGB BT.2020 images with that transfer function, full range.
-
-    Diffuse white (ITU-R BT.2408: 203 cd/m2 in PQ, 75 % in HLG, whose light is taken as the scene's) stays near white;
-    above `_KNEE` the largest channel bends towards 1 and takes the others along, so that hues stay.
-    """
-    light = cv2.transform(_light(transfer)[rgb], RGB_FROM_2020.astype(np.float32)).clip(0)
-    largest = light.max(axis=2, keepdims=True)
-    over = (largest - _KNEE).clip(0) / (1 - _KNEE)
-    bent = np.minimum(largest, _KNEE) + (1 - _KNEE) * over / (1 + over)
-    light *= bent / np.maximum(largest, np.float32(1e-6))
-    return srgb_of(light)
-
-
-@functools.cache
-def _light(transfer: str) -> NDArray[np.float32]:
-    """(65536,) light of a channel's values, 1 = diffuse white (ITU-R BT.2100)."""
-    signal = np.arange(65536) / 65535
-    if transfer == "HLG":
-        a, b, c = 0.17883277, 0.28466892, 0.55991073
-        scene = np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12)
-        return (scene / ((np.exp((0.75 - c) / a) + b) / 12)).astype(np.float32)
-    m1, m2, c1, c2, c3 = 2610 / 16384, 2523 / 32, 3424 / 4096, 2413 / 128, 2392 / 128
-    root = signal ** (1 / m2)
-    return (10000 / 203 * ((root - c1).clip(0) / (c2 - c3 * root)) ** (1 / m1)).astype(np.float32)
-
-
 def has_pyav() -> bool:
     """Return whether PyAV is there (the extra "hdr")."""
     try:
@@ -204,42 +189,30 @@ def has_pyav() -> bool:
     return True
 
 
-@dataclass(frozen=True)
-class StreamFacts:
-    """Whether FFmpeg takes a stream, or one of its first frames, for interlaced; and "HLG" or "PQ" where the stream
-    itself says that it is HDR."""
-
-    is_interlaced: bool = False
-    transfer: str = ""
-
-
-def read_facts(path: Path, frames: int, track: int = 0) -> StreamFacts:
-    """Read the facts of a video track from its first `frames`, by PyAV; without it, and then nothing of HDR, by what
-    FFmpeg complains of. What cannot be read has none."""
-    return _by_pyav(path, frames, track) if has_pyav() else StreamFacts(_by_listening(path, frames))
-
-
-def _by_pyav(path: Path, frames: int, track: int) -> StreamFacts:
+def read_facts(path: Path, frames: int, track: int = 0) -> tuple[bool, str]:
+    """Return whether FFmpeg takes a video track, or one of its first `frames`, for interlaced; and "HLG" or "PQ" where
+    the stream itself says that it is HDR. Without PyAV nothing of HDR, and the first by what FFmpeg complains of. What
+    cannot be read is (False, "")."""
+    if not has_pyav():
+        return _interlaced_by_ffmpeg_log(path, frames), ""
     import av
 
     try:
         with av.open(str(path), options=OPEN_OPTIONS) as container:
-            if track >= len(container.streams.video):
-                return StreamFacts()
             stream = container.streams.video[track]
             stream.thread_type = "AUTO"
             transfer = TRANSFERS.get(int(stream.codec_context.color_trc), "")
             if stream.codec_context.field_order > _PROGRESSIVE:
-                return StreamFacts(True, transfer)
+                return True, transfer
             first = itertools.islice(container.decode(stream), frames)
-            return StreamFacts(any(frame.interlaced_frame for frame in first), transfer)
-    except (av.FFmpegError, OSError, ValueError):
-        return StreamFacts()
+            return any(frame.interlaced_frame for frame in first), transfer
+    except (av.FFmpegError, OSError, ValueError, IndexError):
+        return False, ""
 
 
-def _by_listening(path: Path, frames: int) -> bool:
+def _interlaced_by_ffmpeg_log(path: Path, frames: int) -> bool:
     """OpenCV asks FFmpeg for its errors once, when it is first used: only another process can hear them."""
-    said = {"OPENCV_FFMPEG_LOGLEVEL": "16", "OPENCV_FFMPEG_CAPTURE_OPTIONS": as_opencv_writes_them()}
+    said = {"OPENCV_FFMPEG_LOGLEVEL": "16", "OPENCV_FFMPEG_CAPTURE_OPTIONS": opencv_capture_options()}
     command = [sys.executable, "-c", _LISTEN, str(path.resolve()), str(frames)]
     try:
         done = subprocess.run(command, env=os.environ | said, capture_output=True, timeout=_TIMEOUT, check=False)
@@ -248,26 +221,133 @@ def _by_listening(path: Path, frames: int) -> bool:
     return b"interlaced" in done.stdout + done.stderr
 
 
-def unreadable(path: Path, codec: str, first: int = 0) -> InputError:
+def interlaced_error(path: Path, codec: str, first: int = 0) -> InputError:
     """Say that a video is interlaced from frame `first` on and how to convert it; `codec` by its four letters or
     FFmpeg's name. HEVC stores each field as a picture of its own, which have to be joined first."""
-    file = shlex.quote(str(path))
+    install, filters = "", "yadif"
     if codec.lower() in ("hevc", "hev1", "hvc1"):
-        return InputError(
-            f"{path} is interlaced video whose fields are stored as separate images: convert it with "
-            f"`ffmpeg -i {file} -vf weave,bwdif OUT.mp4`"
-        )
-    if has_pyav():
-        return InputError(
-            f"{path} is interlaced from about frame {first} on, and progressive before: convert it with "
-            f"`ffmpeg -i {file} -vf yadif OUT.mp4`"
-        )
-    return InputError(
-        f"{path} is interlaced video (as from camcorders and television), which OpenCV does not decode: install PyAV "
-        f"with `{install_extra('hdr')}`, or convert it with `ffmpeg -i {file} -vf yadif OUT.mp4`"
-    )
+        what, filters = f"{path} is interlaced video whose fields are stored as separate images", "weave,bwdif"
+    elif has_pyav():
+        what = f"{path} is interlaced from about frame {first} on, and progressive before"
+    else:
+        what = f"{path} is interlaced video (as from camcorders and television), which OpenCV does not decode"
+        install = f"install PyAV with `{install_extra('hdr')}`, or "
+    fix = f"{install}convert it with `ffmpeg -i {shlex.quote(str(path))} -vf {filters} OUT.mp4`"
+    return InputError(f"{what}: {fix}")
 
 
-def as_opencv_writes_them() -> str:
+def opencv_capture_options() -> str:
     """Return OPEN_OPTIONS as the variable OPENCV_FFMPEG_CAPTURE_OPTIONS has them."""
     return "|".join(f"{name};{value}" for name, value in OPEN_OPTIONS.items())
+
+
+# writing -------------------------------------------------------------------------------------------------------------
+
+
+def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, codec: str | None = None) -> Path:
+    """Encode RGB frames (H, W, 3) of one size, atomically: MPEG-4 for .mp4, lossless FFV1 for .avi and .mkv, or by a
+    codec of those four letters.
+
+    An odd row or column at the end is left out: MPEG-4 has none. Returns `path`. Raises InputError for another ending,
+    no frame at all, or a codec that this OpenCV does not have; ValueError for frames of different sizes.
+    """
+    codec = codec or CODECS.get(path.suffix.lower())
+    if codec is None:
+        raise InputError(f"{path}: cannot tell the video format; give a file name that ends in {' or '.join(CODECS)}")
+    require_unicode(path)  # OpenCV ends the whole process
+    pictures = _even(path, frames)
+    first = next(pictures)
+    with atomic_path(path) as temporary:
+        writer = _open_writer(temporary, codec, fps, first.shape[1::-1])
+        written = 0
+        try:
+            for frame in chain([first], pictures):
+                writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+                written += 1
+        finally:
+            writer.release()
+        _require_all(temporary, path, written)
+    return path
+
+
+def _even(path: Path, frames: Iterable[NDArray[np.uint8]]) -> Iterator[NDArray[np.uint8]]:
+    """The frames without an odd row or column at the end."""
+    shape: tuple[int, ...] | None = None
+    for frame in frames:
+        even = np.ascontiguousarray(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2])
+        shape = shape or even.shape
+        if even.shape != shape:
+            raise ValueError(f"write_video: a frame of {even.shape} among those of {shape}")
+        yield even
+    if shape is None:
+        raise InputError(f"{path}: there is no frame to write")
+
+
+def _require_all(temporary: Path, path: Path, written: int) -> None:
+    """OpenCV says nothing of a disk that has become full: look whether every frame can be read again."""
+    capture = cv2.VideoCapture(str(temporary))
+    found = 0
+    while capture.grab():
+        found += 1
+    capture.release()
+    if found != written:
+        raise DiskFullError(
+            f"{path}: only {found} of {written} frames could be written, {free_bytes(path.parent) / 1e6:.0f} MB are "
+            "free: free some space, or choose another place"
+        )
+
+
+def _open_writer(path: Path, codec: str, fps: float, size: Sequence[int]) -> cv2.VideoWriter:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), fps, size)
+    if not writer.isOpened():
+        if is_disk_full(OSError(), path.parent):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        raise InputError(f"{path}: this OpenCV cannot write {codec} video; install opencv-python-headless from PyPI")
+    return writer
+
+
+def write_browser_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, codec: str = "") -> str:
+    """Encode RGB frames (H, W, 3) of one size into an .mp4, atomically; returns the name of its codec: `codec`, or the
+    best that is here. An odd row or column at the end is left out.
+
+    Raises InputError where there is no frame.
+    """
+    codec = codec or best_codec()
+    if codec != H264:
+        write_video(path, frames, fps, "vp09" if codec == VP9 else "mp4v")
+        return codec
+    import av
+
+    pictures = _even(path, frames)
+    first = next(pictures)
+    with (
+        atomic_path(path) as temporary,
+        av.open(str(temporary), "w", format="mp4", options={"movflags": "+faststart"}) as container,
+    ):
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
+        stream.height, stream.width = first.shape[:2]
+        stream.pix_fmt, stream.options = "yuv420p", {"crf": _QUALITY}
+        for frame in chain([first], pictures):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode(None))
+    return codec
+
+
+def best_codec() -> str:
+    """Return the first of H.264, VP9 and MPEG-4 part 2 that can be written here."""
+    if _has_x264():
+        return H264
+    with tempfile.TemporaryDirectory() as folder:
+        writer = cv2.VideoWriter(str(Path(folder) / "trial.mp4"), cv2.VideoWriter.fourcc(*"vp09"), 10.0, (64, 64))
+        found = writer.isOpened()
+        writer.release()
+    return VP9 if found else MPEG4
+
+
+def _has_x264() -> bool:
+    try:
+        import av
+
+        return av.codec.Codec("libx264", "w").name == "libx264"
+    except (ImportError, ValueError):  # an FFmpeg without it says UnknownCodecError, which is a ValueError
+        return False

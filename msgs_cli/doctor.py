@@ -120,7 +120,7 @@ def _video() -> Finding:
     import numpy as np
 
     from ..formats.video import VideoReader
-    from ..formats.video_writer import write_video
+    from ..formats.video_streams import write_video
 
     frames = [np.full((48, 64, 3), 40 * i + np.arange(64)[:, None], np.uint8) for i in range(5)]
     with tempfile.TemporaryDirectory() as folder:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..formats.errors import InputError
-from ..formats.gaussians import GaussianCloud, isotropic_cloud
+from ..formats.splats import GaussianCloud, isotropic_cloud
 from .config import Config
 from .geometry.se3 import Similarity
 from .geometry.sparse_model import FrameObservations, SparseModel

@@ -19,8 +19,8 @@ from .run.manifest import StageRecord, recorded_config
 from .run.progress import ProgressFile
 from .run.runner import run_stages
 from .run.stages import Later, Stage, TaskWorkers
+from .source.files import require_different
 from .source.recording import open_recording
-from .source.videos import require_different
 from .system.machine import available_cpus, require_device
 from .system.progress import Progress
 from .system.wording import quoted

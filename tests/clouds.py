@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.gaussians import GaussianCloud
+from msgs_slam.formats.splats import GaussianCloud
 
 
 def random_cloud(count: int = 300, extent: float = 5.0, seed: int = 0) -> GaussianCloud:

@@ -13,9 +13,8 @@ import plyfile
 import zstandard
 from numpy.typing import NDArray
 
-from msgs_slam.formats.gaussians import GaussianCloud
-from msgs_slam.formats.glb import COMPRESSION, EXTENSION, LABEL
-from msgs_slam.formats.ply import SH_C0
+from msgs_slam.formats.glb import LABEL
+from msgs_slam.formats.splats import COMPRESSION, EXTENSION, SH_C0, GaussianCloud
 
 FLIP = np.array([1, -1, -1], np.float32)
 

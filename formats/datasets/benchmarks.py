@@ -20,10 +20,10 @@ from ..images import first_readable, image_size
 from ..textfile import is_number, read_table
 from ..trajectory import clean_poses, poses_from_quaternions, read_matrices, read_tum
 from .calibration import read_intrinsics_json, read_yaml
-from .matching import (
+from .folder import (
     SAME_INSTANT_SECONDS,
     SENSOR_RATE,
-    classes_found,
+    classes_of,
     files_for_images,
     nearest_index,
     poses_at,
@@ -31,7 +31,7 @@ from .matching import (
     read_timed_files,
     sequence_of,
 )
-from .sequence import Camera, Dataset, LabelClass, known_classes
+from .sequence import Camera, Dataset, LabelClass
 
 _CLASS_FOLDERS = ("semantic_class", "semantic_classes")
 
@@ -71,16 +71,24 @@ def open_seven_scenes(path: Path) -> Dataset:
         "7scenes", path, images,
         timestamps=np.array(numbers, dtype=np.float64) / SENSOR_RATE,
         camera=_seven_scenes_camera(path / "camera-intrinsics-color.txt", size, _COLOR_FOCAL),
-        world_from_cam=np.stack([_seven_scenes_pose(p) for p in images]),
+        world_from_cam=np.stack([pose_in(p.with_name(p.name.split(".")[0] + ".pose.txt")) for p in images]),
         depth_paths=files_for_images(images, path, "*.depth.png"),
         depth_camera=_seven_scenes_camera(path / "camera-intrinsics.txt", (640, 480), _DEPTH_FOCAL),
         notes=_SEVEN_SCENES_NOTES,
     )  # fmt: skip
 
 
-def _seven_scenes_pose(image: Path) -> NDArray[np.float64]:
-    path = image.with_name(image.name.split(".")[0] + ".pose.txt")
+def pose_in(path: Path) -> NDArray[np.float64]:
+    """Read the one (4, 4) pose of a frame from its file; NaN where there is none."""
     return read_matrices(path)[0] if path.is_file() else np.full((4, 4), np.nan)
+
+
+def calibration_matrix(path: Path) -> NDArray[np.float64]:
+    """Read (3, 3) of a file of 3x3 or 4x4 numbers. Raises InputError for fewer."""
+    k = read_table(path, 3)
+    if len(k) < 3:
+        raise InputError(f"{path} has {len(k)} rows, expected a 3x3 or 4x4 calibration matrix")
+    return k[:3]
 
 
 def _seven_scenes_camera(path: Path, size: tuple[int, int], focal: float) -> Camera:
@@ -88,9 +96,7 @@ def _seven_scenes_camera(path: Path, size: tuple[int, int], focal: float) -> Cam
     if not path.is_file():
         scale = width / 640
         return Camera(width, height, focal * scale, focal * scale, width / 2, height / 2, is_nominal=True)
-    k = read_table(path, 3)
-    if k.shape != (3, 3):
-        raise InputError(f"{path} has {len(k)} rows of 3 numbers, expected a 3x3 calibration matrix")
+    k = calibration_matrix(path)
     return Camera(width, height, float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
 
 
@@ -133,7 +139,7 @@ def _tum_camera(path: Path, image: Path) -> tuple[Camera | None, tuple[str, ...]
     if abs(width / height - 640 / 480) > 0.02:
         return None, ("the images have not the shape of a Kinect's: the camera is taken to be unknown",)
     notes = () if found else ("the folder's name states no freiburg camera: a focal length near 525 is expected",)
-    camera = Camera.from_integer_centres(640, 480, fx, fy, cx, cy, distortion).resized(width, height)
+    camera = Camera(640, 480, fx, fy, cx + 0.5, cy + 0.5, distortion).resized(width, height)
     return replace(camera, is_nominal=not found), notes
 
 
@@ -144,27 +150,16 @@ def open_euroc(path: Path) -> Dataset:
     or the calibration cannot be read.
     """
     root = path / "mav0" if (path / "mav0" / "cam0").is_dir() else path
-    times, images = _euroc_images(root / "cam0")
+    times, images = read_timed_files(root / "cam0" / "data.csv", root / "cam0" / "data", int, "`nanoseconds,file`")
+    times *= _NANOSECONDS
     camera, body_from_cam = _euroc_calibration(root / "cam0" / "sensor.yaml")
-    poses = _euroc_poses(root / "state_groundtruth_estimate0" / "data.csv", times, body_from_cam)
+    truth, poses = root / "state_groundtruth_estimate0" / "data.csv", None
+    if truth.is_file():
+        table = read_table(truth, 8)  # time, position, quaternion w x y z of the body in the world
+        world_from_body = poses_from_quaternions(table[:, [5, 6, 7, 4]], table[:, 1:4], str(truth))
+        poses = poses_at(times, table[:, 0] * _NANOSECONDS, world_from_body @ body_from_cam)
     notes = ("the right camera, cam1/, is not read",) if (root / "cam1").is_dir() else ()
     return sequence_of("euroc", path, images, timestamps=times, camera=camera, world_from_cam=poses, notes=notes)
-
-
-def _euroc_images(cam: Path) -> tuple[NDArray[np.float64], list[Path]]:
-    times, files = read_timed_files(cam / "data.csv", cam / "data", int, "`nanoseconds,file`")
-    return times * _NANOSECONDS, files
-
-
-def _euroc_poses(
-    path: Path, times: NDArray[np.float64], body_from_cam: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
-    """Rows of time, position, quaternion w x y z of the body in the world."""
-    if not path.is_file():
-        return None
-    table = read_table(path, 8)
-    world_from_body = poses_from_quaternions(table[:, [5, 6, 7, 4]], table[:, 1:4], str(path))
-    return poses_at(times, table[:, 0] * _NANOSECONDS, world_from_body @ body_from_cam)
 
 
 def _euroc_calibration(path: Path) -> tuple[Camera, NDArray[np.float64]]:
@@ -176,7 +171,7 @@ def _euroc_calibration(path: Path) -> tuple[Camera, NDArray[np.float64]]:
     transform = np.array(_listed(inner if isinstance(inner, dict) else {}, path, "data", 16)).reshape(1, 4, 4)
     if not np.isfinite([width, height, *transform.ravel()]).all():
         raise InputError(f"{path}: a number is not finite: unpack the data set again")
-    camera = Camera.from_integer_centres(int(width), int(height), fx, fy, cx, cy, tuple(distortion))
+    camera = Camera(int(width), int(height), fx, fy, cx + 0.5, cy + 0.5, tuple(distortion))
     return camera, clean_poses(transform, str(path))[0]
 
 
@@ -189,9 +184,17 @@ def _listed(table: dict[str, Any], path: Path, key: str, count: int) -> list[flo
     return values
 
 
-def recognises_replica(path: Path) -> bool:
-    """Recognise results/frame*.jpg with traj.txt (NICE-SLAM), or rgb/ with semantic_class/ (Semantic-NeRF, vMAP)."""
-    return _is_nice_slam(path) or any(_is_rendered(p) for p in _candidates(path))
+def replica_folder(path: Path) -> Path | None:
+    """Return the folder, this one or one in it, with results/frame*.jpg and traj.txt (NICE-SLAM), or with rgb/ and
+    semantic_class/ (Semantic-NeRF, vMAP)."""
+    if _is_nice_slam(path):
+        return path
+    rendered = (p for p in (path, path / "imap" / "00", path / "Sequence_1") if (p / "rgb").is_dir())
+    return next((p for p in rendered if any((p / name).is_dir() for name in _CLASS_FOLDERS)), None)
+
+
+def _is_nice_slam(path: Path) -> bool:
+    return (path / "traj.txt").is_file() and any((path / "results").glob("frame*.*"))
 
 
 def open_replica(path: Path) -> Dataset:
@@ -200,79 +203,53 @@ def open_replica(path: Path) -> Dataset:
     Without cam_params.json the renders have a horizontal field of view of 90 degrees in all layouts. Raises InputError
     where the parts do not fit together.
     """
-    if _is_nice_slam(path):
-        return _open_nice_slam(path)
-    for candidate in _candidates(path):
-        if _is_rendered(candidate):
-            return _open_rendered(candidate)
-    raise InputError(f"{path} is no Replica sequence: expected results/ and traj.txt, or rgb/ and semantic_class/")
-
-
-def _candidates(path: Path) -> tuple[Path, ...]:
-    return path, path / "imap" / "00", path / "Sequence_1"
-
-
-def _is_nice_slam(path: Path) -> bool:
-    return (path / "traj.txt").is_file() and any((path / "results").glob("frame*.*"))
-
-
-def _is_rendered(path: Path) -> bool:
-    return (path / "rgb").is_dir() and any((path / name).is_dir() for name in _CLASS_FOLDERS)
+    folder = replica_folder(path)
+    if folder is None:
+        raise InputError(f"{path} is no Replica sequence: expected results/ and traj.txt, or rgb/ and semantic_class/")
+    return _open_nice_slam(folder) if _is_nice_slam(folder) else _open_rendered(folder)
 
 
 def _open_nice_slam(path: Path) -> Dataset:
     images = [p for p in list_images(path / "results") if p.name.startswith("frame")]
-    parameters = next((p / "cam_params.json" for p in (path, path.parent) if (p / "cam_params.json").is_file()), None)
-    camera, scale = _wide_camera(first_readable(images)), 6553.5
-    if parameters is not None:
-        camera, given = read_intrinsics_json(parameters, integer_centres=True)
-        scale = given or scale
+    camera, scale = _replica_camera((path, path.parent), images)
     return sequence_of(
         "replica", path, images,
         camera=camera,
         world_from_cam=poses_for_images(images, read_matrices(path / "traj.txt"), path / "traj.txt"),
         depth_paths=files_for_images(images, path / "results", "depth*"),
-        depth_per_metre=scale,
+        depth_per_metre=scale or 6553.5,
         depth_invalid=(0,),  # at 6553.5 a metre, 65535 is a true 10 m
     )  # fmt: skip
 
 
 def _open_rendered(path: Path) -> Dataset:
+    """traj_w_c.txt is the released trajectory; one that was estimated later goes by another traj*.txt."""
     images = list_images(path / "rgb")
-    camera, scale = _wide_camera(first_readable(images)), None
-    if (path / "cam_params.json").is_file():
-        camera, scale = read_intrinsics_json(path / "cam_params.json", integer_centres=True)
-    label_folder = next(path / name for name in _CLASS_FOLDERS if (path / name).is_dir())
-    label_paths = files_for_images(images, label_folder)
+    camera, scale = _replica_camera((path,), images)
+    label_paths = files_for_images(images, next(path / name for name in _CLASS_FOLDERS if (path / name).is_dir()))
+    truth = next((p for p in (path / "traj_w_c.txt", *sorted(path.glob("traj*.txt"))) if p.is_file()), None)
     return sequence_of(
         "replica", path, images,
         camera=camera,
-        world_from_cam=_rendered_poses(path, images),
+        world_from_cam=None if truth is None else poses_for_images(images, read_matrices(truth), truth),
         depth_paths=files_for_images(images, path / "depth"),
         depth_per_metre=scale or 1000.0,
         label_paths=label_paths,
-        classes=_classes(path, label_paths),
+        classes=_replica_classes(path, label_paths),
     )  # fmt: skip
 
 
-def _rendered_poses(path: Path, images: list[Path]) -> NDArray[np.float64] | None:
-    """traj_w_c.txt is the released one; a trajectory estimated later goes by another traj*.txt."""
-    files = [path / "traj_w_c.txt", *sorted(path.glob("traj*.txt"))]
-    file = next((p for p in files if p.is_file()), None)
-    return None if file is None else poses_for_images(images, read_matrices(file), file)
+def _replica_camera(places: tuple[Path, ...], images: list[Path]) -> tuple[Camera, float | None]:
+    file = next((p / "cam_params.json" for p in places if (p / "cam_params.json").is_file()), None)
+    if file is not None:
+        return read_intrinsics_json(file, integer_centres=True)
+    width, height = image_size(first_readable(images))
+    return Camera(width, height, width / 2, width / 2, width / 2, height / 2), None
 
 
-def _wide_camera(image: Path) -> Camera:
-    width, height = image_size(image)
-    return Camera(width, height, width / 2, width / 2, width / 2, height / 2)
-
-
-def _classes(path: Path, label_paths: tuple[Path | None, ...]) -> tuple[LabelClass, ...]:
-    if not label_paths:
-        return ()
+def _replica_classes(path: Path, label_paths: tuple[Path | None, ...]) -> tuple[LabelClass, ...]:
     places = (path, path.parent, path.parent.parent)
     files = [p / "info_semantic.json" for p in places]
     files += [p.parent / "semantic_info" / p.name / "info_semantic.json" for p in places]
-    file = next((f for f in files if f.is_file()), None)
-    classes = classes_found(label_paths) if file is None else known_classes(file)
+    classes = classes_of(label_paths, next((f for f in files if f.is_file()), None))
     return tuple(c for c in classes if c.id != 0)

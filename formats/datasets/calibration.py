@@ -5,19 +5,23 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
-from ..colmap_files import cameras_in
+from ..colmap import cameras_in
 from ..errors import InputError
 from ..reading import parsing, read_bytes
 from ..textfile import is_number, number, optional_number, read_json, read_json_object, read_rows, read_text, read_xml
-from .colmap import camera_from_colmap
 from .sequence import Camera, distortion_names
 
 FORMATS = (
     "JSON (fx, fy, cx, cy, width, height, distortion), OpenCV's YAML, XML or JSON, Kalibr's camchain.yaml, COLMAP's "
     "cameras.txt or cameras.bin, a 3x3 matrix as text"
 )
+HOW_INTRINSICS = "give fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file that holds them"
 _PERSPECTIVE = ("", "none", "opencv", "pinhole", "plumb_bob", "radtan", "rational_polynomial")
 _FISHEYE = ("equidistant", "fisheye")
+_COLMAP_MODELS = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV",
+    "OPENCV_FISHEYE", "FULL_OPENCV",
+)  # fmt: skip
 _MAX_BYTES = 2_000_000
 _MAX_YAML = 256_000
 """Characters, with room for the corners that OpenCV adds; the YAML reader takes two seconds for so many."""
@@ -33,14 +37,40 @@ def read_calibration_file(path: Path, size: tuple[int, int]) -> dict[str, Camera
     with parsing(path, "calibration file", f"files that work: {FORMATS}"):
         if suffix == ".bin":
             return {str(i): _of_colmap(model, (w, h, *params), path) for i, model, w, h, params in cameras_in(data)}
-        rows = read_rows(path) if suffix == ".txt" else []
-        if rows and len(rows[0]) > 4 and rows[0][1].isupper():
+        rows = read_rows(path) if suffix != ".json" else []
+        words = [word for row in rows for word in row]
+        if words and all(map(is_number, words)):
+            return {"camera": camera_from_numbers([float(word) for word in words], size, str(path))}
+        if suffix == ".txt" and rows and len(rows[0]) > 4 and rows[0][1].isupper():
             return {row[0]: _of_colmap(row[1], tuple(map(float, row[2:])), path) for row in rows}
-        table = _table_in(path, suffix)
+        if suffix == ".json":
+            table = read_json(path)
+        else:
+            text = read_text(path)
+            table = _of_xml(read_xml(path, _MAX_BYTES)) if text.lstrip().startswith("<") else _of_yaml(text)
         found = _cameras_in(table, path, size) if isinstance(table, dict) else {}
     if not found:
         raise InputError(f"{path} holds no camera: files that work: {FORMATS}")
     return found
+
+
+def camera_from_numbers(numbers: list[float], size: tuple[int, int], where: str) -> Camera:
+    """Return the camera of images of `size` from fx, fy, cx, cy[, k1, k2, p1, p2] or the nine numbers of a calibration
+    matrix; `where` they stand is for errors."""
+    if len(numbers) == 9:
+        fx, skew, cx, zero, fy, cy, *last_row = numbers
+        if (skew, zero, *last_row) != (0, 0, 0, 0, 1):
+            raise InputError(f"{where} holds nine numbers that are no calibration matrix: {HOW_INTRINSICS}")
+        numbers = [fx, fy, cx, cy]
+    if len(numbers) not in (4, 5, 6, 8):
+        raise InputError(f"{where}: {len(numbers)} numbers: {HOW_INTRINSICS}")
+    (width, height), (fx, fy, cx, cy, *lens) = size, numbers
+    if not (0 < cx < width and 0 < cy < height):
+        raise InputError(
+            f"{where}: the principal point ({cx:g}, {cy:g}) lies outside the {width}x{height} source: give it in "
+            "pixels of the source, in the order fx,fy,cx,cy"
+        )
+    return Camera(width, height, fx, fy, cx, cy, (*lens, 0.0, 0.0, 0.0, 0.0)[:4])
 
 
 def _cameras_in(table: dict[str, Any], path: Path, size: tuple[int, int]) -> dict[str, Camera]:
@@ -85,13 +115,6 @@ def _counted_from_zero(
     return camera_from_table(
         {**plain, "model": "FISHEYE" if model in _FISHEYE else "", "distortion": lens}, path, integer_centres=True
     )
-
-
-def _table_in(path: Path, suffix: str) -> Any:
-    if suffix == ".json":
-        return read_json(path)
-    text = read_text(path)
-    return _of_xml(read_xml(path, _MAX_BYTES)) if text.lstrip().startswith("<") else _of_yaml(text)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -159,6 +182,20 @@ def _of_colmap(model: str | int, numbers: tuple[float, ...], path: Path) -> Came
     return camera
 
 
+def camera_from_colmap(
+    name: str, width: int, height: int, parameters: tuple[float, ...]
+) -> tuple[Camera | None, tuple[str, ...]]:
+    """Return the camera of a COLMAP model name with its parameters; None and a note where it has no OpenCV
+    equivalent."""
+    if name not in _COLMAP_MODELS:
+        return None, (f"COLMAP's camera model {name} is not supported: the model's intrinsics are not used",)
+    has_one_focal = name.startswith(("SIMPLE_", "RADIAL"))
+    fx, fy, cx, cy, *k = (parameters[0], *parameters) if has_one_focal else parameters
+    k = k if any(k[5:]) else k[:5]
+    distortion = (*k, *[0.0] * (4 - len(k)))
+    return Camera(width, height, fx, fy, cx, cy, distortion, name.endswith("FISHEYE")), ()
+
+
 def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, float | None]:
     """Read the camera, and raw depth units per metre where the file says so.
 
@@ -197,27 +234,20 @@ def camera_from_table(table: dict[str, Any], path: Path, *, integer_centres: boo
 
 
 def _distortion(table: dict, path: Path, names: tuple[str, ...]) -> tuple[float, ...]:
+    """In OpenCV's order, as `Camera` has them; no thin prism or tilt coefficients (the 9th to 14th) but zeros."""
     values = table.get("distortion")
     if values is None:
         return _trimmed([optional_number(table, path, name) or 0.0 for name in names])
+    most = min(len(names), 5)
     is_numbers = isinstance(values, list) and all(isinstance(v, int | float) for v in values)
-    found = coefficients(values, names) if is_numbers else None
-    if found is None:
-        usual = f"up to {min(len(names), 5)}: {', '.join(names[:5])}" + (", or 8 with k4, k5, k6" if names[5:] else "")
+    if not is_numbers or any(values[len(names) :]) or len(values) not in (*range(1, most + 1), 8, 12, 14):
+        usual = f"up to {most}: {', '.join(names[:5])}" + (", or 8 with k4, k5, k6" if names[5:] else "")
         raise InputError(f"{path}: distortion is {str(values)[:80]}, expected {usual}")
-    return found
-
-
-def coefficients(values: list[float], names: tuple[str, ...]) -> tuple[float, ...] | None:
-    """Return the distortion coefficients of a list in OpenCV's order, as `Camera` has them; None for a list of another
-    length, or with thin prism or tilt coefficients (the 9th to 14th) that are not zero."""
-    if any(values[len(names) :]) or len(values) not in (*range(1, min(len(names), 5) + 1), 8, 12, 14):
-        return None
-    found = tuple(float(v) for v in values[: len(names)])
-    return (*found, 0.0, 0.0, 0.0)[: max(4, len(found))] if len(found) <= 5 else _trimmed(list(found))
+    found = [float(v) for v in values[: len(names)]]
+    return (*found, 0.0, 0.0, 0.0)[: max(4, len(found))] if len(found) <= 5 else _trimmed(found)
 
 
 def _trimmed(values: list[float]) -> tuple[float, ...]:
     """Without trailing zeros that another lens model would have: 4, 5 or 8 coefficients."""
-    padded = (*values, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)[:8]
+    padded = (*values, *[0.0] * 8)[:8]
     return padded if any(padded[5:]) else padded[:5] if padded[4] else padded[:4]

@@ -4,22 +4,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ..colmap import ColmapModel, read_colmap_model
-from ..colmap_files import find_models
+from ..colmap import ColmapModel, find_models, read_colmap_model
 from ..errors import InputError
-from ..image_folder import count_images, natural_key
-from ..reading import Listed, named_file, resolve_within
-from .matching import images_outside, sequence_of
+from ..image_folder import Listed, count_images, named_file, natural_key
+from ..reading import resolve_within
+from .calibration import camera_from_colmap
+from .folder import images_outside, sequence_of
 from .sequence import Camera, Dataset
 
 _IMAGE_FOLDERS = ("images", "frames", ".", "rgb", "images_2", "images_4", "images_8")
 """Where a project keeps its images; those of images_N are reduced to one N-th, and the camera with them."""
 _LEVELS_UP, _MAX_NAMED = 3, 3
-
-
-def is_colmap_model(path: Path) -> bool:
-    """Recognise a folder with a complete model, as text or binary, with its images in reach."""
-    return path.is_dir() and bool(find_models(path))
 
 
 def open_colmap(path: Path) -> Dataset:
@@ -72,18 +67,14 @@ def _notes(
     path: Path, root: Path, folder: Path, others: list[Path], posed: int, in_model: int, unposed: int
 ) -> tuple[str, ...]:
     """What of the project is missing, and what of it has no part in the sequence."""
-    notes = []
-    if posed < in_model:
-        notes.append(f"{in_model - posed} of the model's {in_model} images are missing in {root}")
-    if unposed:
-        notes.append(
-            f"{unposed} of the {posed + unposed} images in {root.name}/ have no pose in the model {folder.name}/: they "
-            f"are used as well. Where poses of the others help, give --poses {path}"
-        )
-    if others:
-        named = " and ".join(f"{other.name}/" for other in others[:_MAX_NAMED]) + (", …" * (len(others) > _MAX_NAMED))
-        notes.append(f"of {len(others) + 1} models the largest, {folder.name}/, is used, not {named}")
-    return tuple(notes)
+    named = " and ".join(f"{other.name}/" for other in others[:_MAX_NAMED]) + (", …" * (len(others) > _MAX_NAMED))
+    said = (
+        (posed < in_model, f"{in_model - posed} of the model's {in_model} images are missing in {root}"),
+        (unposed, f"{unposed} of the {posed + unposed} images in {root.name}/ have no pose in the model {folder.name}/"
+         f": they are used as well. Where poses of the others help, give --poses {path}"),
+        (others, f"of {len(others) + 1} models the largest, {folder.name}/, is used, not {named}"),
+    )  # fmt: skip
+    return tuple(text for holds, text in said if holds)
 
 
 def _other_folders(path: Path, root: Path, images: list[Path]) -> list[str]:
@@ -127,25 +118,3 @@ def _shared_camera(model: ColmapModel) -> tuple[Camera | None, tuple[str, ...]]:
         return None, (f"the images have {len(distinct)} different cameras: the model's intrinsics are not used",)
     name, width, height, p = model.cameras[0]
     return camera_from_colmap(name, width, height, p)
-
-
-def camera_from_colmap(
-    name: str, width: int, height: int, p: tuple[float, ...]
-) -> tuple[Camera | None, tuple[str, ...]]:
-    """Return the camera of a COLMAP model name with its parameters; None and a note where it has no OpenCV
-    equivalent."""
-    focal = (p[0], p[0]) if name.startswith(("SIMPLE_", "RADIAL")) else (p[0], p[1])
-    rest = p[1:] if name.startswith(("SIMPLE_", "RADIAL")) else p[2:]
-    k = rest[2:]
-    fisheye = name.endswith("FISHEYE")
-    if name in ("SIMPLE_PINHOLE", "PINHOLE"):
-        distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
-    elif name in ("SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"):
-        distortion = (*k, 0.0, 0.0, 0.0)[:4]
-    elif name in ("OPENCV", "OPENCV_FISHEYE"):
-        distortion = k
-    elif name == "FULL_OPENCV":
-        distortion = k if any(k[5:]) else k[:5]
-    else:
-        return None, (f"COLMAP's camera model {name} is not supported: the model's intrinsics are not used",)
-    return Camera(width, height, *focal, rest[0], rest[1], distortion, fisheye), ()

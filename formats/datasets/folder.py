@@ -1,28 +1,38 @@
-"""Plain folders: images, with companion files under the usual names."""
+"""Plain folders of images with companion files under the usual names: which depth map, label image or pose row belongs
+to which image, here and in data sets that are folders too."""
 
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..image_folder import count_images, list_images, read_image_times
-from ..names import match_names
+from ..image_folder import count_images, folded, frame_number, list_images, match_names, natural_key, read_image_times
+from ..images import IMAGE_SUFFIXES, first_readable, image_size, is_depth_map, read_label_png
+from ..reading import resolve_within
+from ..textfile import read_rows
 from ..trajectory import read_trajectory
 from .calibration import read_intrinsics_json
-from .matching import classes_found, files_for_images, poses_at, poses_for_images, sequence_of
-from .sequence import Camera, Dataset, LabelClass, known_classes
+from .sequence import Dataset, LabelClass, known_classes
+
+Array = NDArray[np.float64]
+
+SENSOR_RATE = 30.0
+"""Frames per second of the sensors of benchmarks that number their frames and state no times."""
+SAME_INSTANT_SECONDS = 0.02
+"""Two sensors' measurements at most this far apart belong together: half a frame at 25 a second."""
 
 _IMAGE_FOLDERS = ("rgb", "images", "color", "frames")
 _DEPTH_FOLDERS = ("depth", "depths")
 _LABEL_FOLDERS = ("labels", "label", "semantic")
 _POSE_FILES = ("traj.txt", "trajectory.txt", "poses.txt", "groundtruth.txt")
 _INTRINSICS_FILES = ("intrinsics.json", "cam_params.json", "camera.json")
-
-
-def is_plain_folder(path: Path) -> bool:
-    """Recognise a folder of images, or one with a folder rgb/, images/, color/ or frames/."""
-    return image_folder(path) is not None
+_MAX_IMAGES_SEARCHED = 300
+_NO_PHOTOGRAPH = re.compile(r"(?<![a-z])(mask|depth|normal|alpha|label|semantic|thumb)s?(?![a-z])", re.IGNORECASE)
 
 
 def open_folder(path: Path) -> Dataset:
@@ -33,27 +43,26 @@ def open_folder(path: Path) -> Dataset:
     distortion, depth_scale, pixel_centre), timestamps.txt, and traj.txt: world-from-camera, a 4x4 matrix or a TUM line
     for each image or each frame number. Raises InputError where one of them contradicts the images.
     """
-    counts = _image_counts(path)
-    folder = _fullest(counts)
+    folder = image_folder(path)
     if folder is None:
         raise InputError(f"no images in {path}: give the folder that holds the images, or one above rgb/ or images/")
     images = list_images(folder)
     root = path if folder != path else _root_of(folder)
     times = read_image_times(images)
     poses, left_out = _poses(images, times, root)
-    camera, depth_scale = _camera(root)
-    depth_paths = _first(images, root, _DEPTH_FOLDERS)
-    label_paths = _first(images, root, _LABEL_FOLDERS)
+    calibration = next((root / name for name in _INTRINSICS_FILES if (root / name).is_file()), None)
+    camera, scale = (None, None) if calibration is None else read_intrinsics_json(calibration, integer_centres=False)
+    label_paths, table = _companions(images, root, _LABEL_FOLDERS), root / "classes.json"
     return sequence_of(
         "folder", root, images,
         timestamps=times,
         camera=camera,
         world_from_cam=poses,
-        depth_paths=depth_paths,
-        depth_per_metre=depth_scale or 1000.0,
+        depth_paths=_companions(images, root, _DEPTH_FOLDERS),
+        depth_per_metre=scale or 1000.0,
         label_paths=label_paths,
-        classes=_classes(root, label_paths),
-        notes=_unused_images(counts, folder) + left_out,
+        classes=classes_of(label_paths, table if table.is_file() else None),
+        notes=_unused_images(path, folder) + left_out,
     )  # fmt: skip
 
 
@@ -63,22 +72,19 @@ def image_folder(path: Path) -> Path | None:
 
     A picture or two beside images/ are thumbnails or plots; the other way round images/ is something else's.
     """
-    return _fullest(_image_counts(path))
-
-
-def _fullest(counts: dict[Path, int]) -> Path | None:
-    return max(counts, key=counts.__getitem__) if any(counts.values()) else None
+    counts = _image_counts(path)
+    return max(counts, key=counts.__getitem__, default=None)
 
 
 def _image_counts(path: Path) -> dict[Path, int]:
-    return {folder: count_images(folder) for folder in (path, *(path / name for name in _IMAGE_FOLDERS))}
+    folders = (path, *(path / name for name in _IMAGE_FOLDERS))
+    return {folder: count for folder in folders if (count := count_images(folder))}
 
 
-def _unused_images(counts: dict[Path, int], used: Path) -> tuple[str, ...]:
-    others = [f"{count} in {folder.name}/" for folder, count in counts.items() if count and folder != used]
-    if not others:
-        return ()
-    return (f"the {counts[used]} images in {used.name}/ are used, not the {' and '.join(others)}",)
+def _unused_images(path: Path, used: Path) -> tuple[str, ...]:
+    counts = _image_counts(path)
+    others = [f"{count} in {folder.name}/" for folder, count in counts.items() if folder != used]
+    return (f"the {counts[used]} images in {used.name}/ are used, not the {' and '.join(others)}",) if others else ()
 
 
 def _root_of(images: Path) -> Path:
@@ -88,21 +94,12 @@ def _root_of(images: Path) -> Path:
     return images.parent if belongs else images
 
 
-def _camera(root: Path) -> tuple[Camera | None, float | None]:
-    for name in _INTRINSICS_FILES:
-        if (root / name).is_file():
-            return read_intrinsics_json(root / name, integer_centres=False)
-    return None, None
-
-
-def _first(images: list[Path], root: Path, folders: tuple[str, ...]) -> tuple[Path | None, ...]:
+def _companions(images: list[Path], root: Path, folders: tuple[str, ...]) -> tuple[Path | None, ...]:
     existing = [root / name for name in folders if (root / name).is_dir() and root / name != images[0].parent]
     return files_for_images(images, existing[0]) if existing else ()
 
 
-def _poses(
-    images: list[Path], times: NDArray[np.float64] | None, root: Path
-) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
+def _poses(images: list[Path], times: Array | None, root: Path) -> tuple[Array | None, tuple[str, ...]]:
     """(N, 4, 4) poses, None without any, and a note where there are some that cannot be assigned."""
     path = next((root / name for name in _POSE_FILES if (root / name).is_file()), None)
     if path is None:
@@ -121,8 +118,130 @@ def _poses(
     return None, (f"{why}: the poses are not used; timestamps.txt with a line for each image would tell",)
 
 
-def _classes(root: Path, label_paths: tuple[Path | None, ...]) -> tuple[LabelClass, ...]:
-    if not label_paths:
+# What belongs to which image ------------------------------------------------------------------------------------------
+
+
+def sequence_of(format: str, root: Path, images: list[Path], **fields: Any) -> Dataset:
+    """Make the sequence of image files, called as they are, at the times that they state, unless the other `fields` say
+    otherwise."""
+    if "timestamps" not in fields:
+        fields["timestamps"] = read_image_times(images)
+    names = fields.pop("names", tuple(p.name for p in images))
+    return Dataset(format, root, names, image_paths=tuple(images), **fields)
+
+
+def read_timed_files(
+    path: Path, folder: Path, read_time: Callable[[str], float], line: str
+) -> tuple[Array, list[Path]]:
+    """Read a list of times and files of a `folder`: (N,) times in increasing order, and the files. Lists are not always
+    sorted, and a few times occur twice.
+
+    `line` is the form of its lines in errors. Raises InputError for another, an empty list, a file outside the folder.
+    """
+    try:
+        entries = sorted({read_time(row[0]): row[1] for row in read_rows(path)}.items())
+    except (IndexError, ValueError) as error:
+        raise InputError(f"{path}: a line is not {line} ({error}): unpack the data set again") from error
+    if not entries:
+        raise InputError(f"{path} lists no files: unpack the data set again")
+    return np.array([time for time, _ in entries], np.float64), [resolve_within(folder, f, path) for _, f in entries]
+
+
+def files_for_images(images: list[Path], folder: Path, pattern: str = "*") -> tuple[Path | None, ...]:
+    """Find for each image the file in `folder` of the same name, else of the same frame number; () without such a
+    folder.
+
+    Raises InputError when the folder has files and none of them belongs to an image.
+    """
+    if not folder.is_dir():
         return ()
-    path = root / "classes.json"
-    return known_classes(path) if path.is_file() else classes_found(label_paths)
+    files = [p for p in folder.glob(pattern) if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
+    files.sort(key=lambda p: natural_key(p.name), reverse=True)  # of several that fit, the first is taken
+    # A name before its dots, and a number, say which image only where no other image has it: of 17.25.png and 17.50.png
+    # both are 17.
+    rules: tuple[Callable[[Path], object], ...] = (
+        lambda p: p.stem, lambda p: folded(p.stem), lambda p: p.name.split(".")[0], frame_number,
+    )  # fmt: skip
+    found: tuple[Path | None, ...] = (None,) * len(images)
+    for rule in rules:
+        keys, file_of = [rule(image) for image in images], {rule(p): p for p in files}
+        times = Counter(keys)
+        usable = [k is not None and times[k] == 1 for k in keys]
+        found = tuple(f or (file_of.get(k) if ok else None) for f, k, ok in zip(found, keys, usable, strict=True))
+    if files and not any(found):
+        raise InputError(
+            f"none of the {len(files)} files in {folder} belongs to an image of {images[0].parent}: "
+            "give both the same file names or frame numbers"
+        )
+    return found if any(found) else ()
+
+
+def images_outside(used: list[Path], taken: Iterable[Path | None] = ()) -> list[Path]:
+    """Return the other images in the folders of those that are `used`: of the same kind and size, neither `taken` as
+    something else nor called so."""
+    first, others = first_readable(used), {*used, *taken}
+    suffixes = {path.suffix.lower() for path in used}
+    found = [p for folder in sorted({path.parent for path in used}) for p in sorted(folder.iterdir())]
+    found = [p for p in found if p.suffix.lower() in suffixes and p not in others and not p.name.startswith(".")]
+    return [p for p in found if not _NO_PHOTOGRAPH.search(p.stem) and p.is_file() and _is_alike(p, first)]
+
+
+def _is_alike(path: Path, first: Path) -> bool:
+    try:
+        return image_size(path) == image_size(first) and not is_depth_map(path)
+    except InputError:
+        return False
+
+
+def poses_for_images(images: list[Path], poses: Array, source: Path) -> Array:
+    """Return (N, 4, 4) the rows of `poses` that belong to the images: one each, else the row of each frame number.
+
+    Raises InputError when neither fits.
+    """
+    if len(poses) == len(images):
+        return poses
+    numbers = [frame_number(p) for p in images]
+    rows = [n for n in numbers if n is not None and n < len(poses)]
+    if len(rows) == len(images):
+        return poses[rows]
+    raise InputError(
+        f"{source} has {len(poses)} poses for {len(images)} images, and the images' names are not row numbers: "
+        "give one pose for each image"
+    )
+
+
+def poses_at(times: Array, pose_times: Array, world_from_cam: Array, tolerance: float = SAME_INSTANT_SECONDS) -> Array:
+    """Return (N, 4, 4) for each of `times` the known pose nearest in time, NaN where none is within `tolerance`
+    seconds."""
+    known = np.isfinite(pose_times) & np.isfinite(world_from_cam).all(axis=(1, 2))
+    if not known.any():
+        return np.full((len(times), 4, 4), np.nan)
+    pose_times, world_from_cam = pose_times[known], world_from_cam[known]
+    order = np.argsort(pose_times, kind="stable")
+    index = order[nearest_index(pose_times[order], times)]
+    result = world_from_cam[index].copy()
+    result[np.abs(pose_times[index] - times) > tolerance] = np.nan
+    return result
+
+
+def nearest_index(sorted_times: Array, times: Array) -> NDArray[np.int64]:
+    """Find (N,) for each of `times` the index of the nearest of `sorted_times`, the earlier of two equally near."""
+    after = np.searchsorted(sorted_times, times).clip(0, len(sorted_times) - 1)
+    before = (after - 1).clip(0)
+    closer = np.abs(sorted_times[before] - times) <= np.abs(sorted_times[after] - times)
+    return np.where(closer, before, after).astype(np.int64)
+
+
+def classes_of(label_paths: tuple[Path | None, ...], table: Path | None) -> tuple[LabelClass, ...]:
+    """Return the classes of a set's table of them, without those that are void; without a table a class for every id
+    that occurs in the label images, named by its number.
+
+    Of long sequences some `_MAX_IMAGES_SEARCHED` evenly spread images are looked at.
+    """
+    existing = [p for p in label_paths if p is not None]
+    if not existing or table is not None:
+        return known_classes(table) if table is not None and label_paths else ()
+    seen = np.zeros(65536, dtype=bool)
+    for path in existing[:: max(1, len(existing) // _MAX_IMAGES_SEARCHED)]:
+        seen[read_label_png(path).ravel()] = True
+    return tuple(LabelClass(int(i), f"class {i}") for i in np.flatnonzero(seen) if i)

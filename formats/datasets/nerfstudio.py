@@ -1,21 +1,21 @@
 """nerfstudio's transforms.json (also instant-ngp's and Blender's), read as a data set and written for its trainers."""
 
-import json
 import math
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..atomic import write_text
 from ..errors import InputError
-from ..image_folder import count_images, list_images, natural_key
+from ..image_folder import Listed, count_images, list_images, named_file, natural_key
 from ..images import first_readable, image_size
-from ..reading import Listed, named_file
-from ..textfile import number, optional_number, read_json_object
-from ..trajectory import OPENCV_FROM_OPENGL, clean_poses
-from .matching import images_outside, sequence_of
+from ..poses import graphics_poses
+from ..textfile import number, optional_number, read_json_object, write_json
+from ..trajectory import OPENCV_FROM_OPENGL
+from .folder import images_outside, sequence_of
 from .sequence import Camera, Dataset, distortion_names
 
 _FILE_NAMES = ("transforms.json", "transforms_train.json")
@@ -34,11 +34,6 @@ _SAME_COEFFICIENT = 0.01
 """By which a distortion coefficient may differ from the mean of all images: less than a pixel for most of the image."""
 
 
-def is_nerfstudio(path: Path) -> bool:
-    """Recognise a folder with transforms.json, or that file itself."""
-    return _file(path) is not None
-
-
 def open_nerfstudio(path: Path) -> Dataset:
     """Open the frames of a transforms.json in natural order of their names, and the images beside them for which it has
     no frame; missing images are left out and counted.
@@ -48,7 +43,7 @@ def open_nerfstudio(path: Path) -> Dataset:
     (mask_path) are black where the scene is not. Raises InputError for a file that does not follow the format or names
     files outside its folder.
     """
-    file = _file(path)
+    file = table_of(path)
     if file is None:
         raise InputError(f"no transforms.json in {path}: give the folder that holds it")
     table = read_json_object(file, allow_nan=True)
@@ -59,8 +54,10 @@ def open_nerfstudio(path: Path) -> Dataset:
     kept = [(image, frame) for image, frame in zip(images, frames, strict=True) if image is not None]
     if not kept:
         raise InputError(_why_no_image(file, frames))
-    _require_different(file, kept)
     frame_of = dict(kept)
+    if len(frame_of) < len(kept):
+        twice, count = Counter(image for image, _ in kept).most_common(1)[0]
+        raise InputError(f"{file}: {count} frames are the image {twice}: put the images where their names say")
     camera, notes = _camera(table, list(frame_of.values()), file, first_readable(list(frame_of)))
     other = {
         key: {image: _other(file, frame, key, folders, seen) for image, frame in kept}
@@ -70,13 +67,13 @@ def open_nerfstudio(path: Path) -> Dataset:
     # What transforms_train.json does not name is meant for testing.
     others = images_outside(list(frame_of), taken) if file.name == _FILE_NAMES[0] else []
     paths = sorted([*frame_of, *others], key=lambda p: natural_key(str(p)))
-    poses = np.stack([_matrix(frame_of[p], file) if p in frame_of else np.full((4, 4), np.nan) for p in paths])
+    matrices = [frame_of[p].get("transform_matrix", "") if p in frame_of else None for p in paths]
     depths, masks = ([found.get(p) for p in paths] for found in other.values())
     return sequence_of(
         "nerfstudio", path, paths,
         names=_names(file, paths),
         camera=camera,
-        world_from_cam=clean_poses(poses @ OPENCV_FROM_OPENGL, str(file)),
+        world_from_cam=graphics_poses(matrices, file),
         metric=any(depths),
         depth_paths=tuple(depths) if any(depths) else (),
         mask_paths=tuple(masks) if any(masks) else (),
@@ -86,24 +83,20 @@ def open_nerfstudio(path: Path) -> Dataset:
 
 def _notes(file: Path, frames: list[dict[str, Any]], kept: int, others: int) -> tuple[str, ...]:
     """What of the data set is missing, and what of it has no part in the sequence."""
-    notes = []
-    if kept < len(frames):
-        notes.append(f"{len(frames) - kept} of {len(frames)} frames have no image on disk")
-    if others:
-        notes.append(
-            f"{others} of {kept + others} images have no frame in {file.name}: they are used as well. Where the poses "
-            f"of the others help, give --poses {file}"
-        )
     unread = sorted({key for frame in frames for key in frame if key.endswith("_path")} - set(_READ_FILES))
-    if unread:
-        notes.append(f"files that the frames name under {', '.join(unread[:_MAX_NAMED])} are not read")
     tables = sorted(p.name for p in file.parent.glob("transforms_*.json") if p != file)
-    if tables:
-        notes.append(f"{', '.join(tables[:_MAX_NAMED])} beside {file.name} {'are' if tables[1:] else 'is'} not read")
-    return tuple(notes)
+    said = (
+        (kept < len(frames), f"{len(frames) - kept} of {len(frames)} frames have no image on disk"),
+        (others, f"{others} of {kept + others} images have no frame in {file.name}: they are used as well. Where the "
+         f"poses of the others help, give --poses {file}"),
+        (unread, f"files that the frames name under {', '.join(unread[:_MAX_NAMED])} are not read"),
+        (tables, f"{', '.join(tables[:_MAX_NAMED])} beside {file.name} {'are' if tables[1:] else 'is'} not read"),
+    )  # fmt: skip
+    return tuple(text for holds, text in said if holds)
 
 
-def _file(path: Path) -> Path | None:
+def table_of(path: Path) -> Path | None:
+    """Return the transforms.json in a folder, or that file itself; None where there is none."""
     if path.is_file():
         return path if path.name in _FILE_NAMES else None
     return next((path / name for name in _FILE_NAMES if (path / name).is_file()), None)
@@ -115,7 +108,7 @@ def _image(file: Path, frame: dict[str, Any], seen: Listed) -> Path | None:
         raise InputError(f"{file}: a frame has no file_path: expected the image's path relative to the file")
     places = _places(file, name, _IMAGE_FOLDERS)
     tried = (named_file(places, name + suffix, file, listed=seen) for suffix in _SUFFIXES_TRIED)
-    return next((p for p in tried if p is not None), None)
+    return next(filter(None, tried), None)
 
 
 def _places(file: Path, name: str, folders: tuple[str, ...]) -> list[Path]:
@@ -126,33 +119,13 @@ def _places(file: Path, name: str, folders: tuple[str, ...]) -> list[Path]:
 
 
 def _why_no_image(file: Path, frames: list[dict[str, Any]]) -> str:
-    if not frames:
-        return f"{file}: none of its 0 frames has an image on disk: export it again"
-    first = frames[0]["file_path"]
-    return (
-        f"{file}: none of its {len(frames)} frames has an image on disk. The first is {first[:300]!r}; no such file is "
-        f"in {file.parent}, nor one of its bare name in {', '.join(_IMAGE_FOLDERS)} there{_what_there_is(file.parent)} "
-        f"(what lies outside of that folder is not read): put the images into {file.parent / _IMAGE_FOLDERS[0]}"
-    )
-
-
-def _what_there_is(folder: Path) -> str:
-    """In words, the images of other names that are in its usual folders."""
-    for inner in (folder / name for name in _IMAGE_FOLDERS):
-        if count := count_images(inner):
-            return f", though {inner.name}/ holds {count} images of other names, such as {list_images(inner)[0].name!r}"
-    return ""
-
-
-def _require_different(file: Path, kept: list[tuple[Path, dict[str, Any]]]) -> None:
-    seen: dict[Path, str] = {}
-    for image, frame in kept:
-        other = seen.setdefault(image, frame["file_path"])
-        if other is not frame["file_path"]:
-            raise InputError(
-                f"{file}: the frames {other!r} and {frame['file_path']!r} both are the image {image}: remove one, or "
-                "put the images where their names say"
-            )
+    why = f"{file}: none of its {len(frames)} frames has an image on disk."
+    if frames:
+        why += f" The first is {frames[0]['file_path'][:300]!r}; what lies outside of the folder is not read."
+    if held := next((p for name in _IMAGE_FOLDERS if count_images(p := file.parent / name)), None):
+        first = list_images(held)[0].name
+        why += f" {held.name}/ holds {count_images(held)} images of other names, such as {first!r}."
+    return f"{why} Put the images into {file.parent / _IMAGE_FOLDERS[0]}"
 
 
 def _other(file: Path, frame: dict[str, Any], key: str, folders: tuple[str, ...], seen: Listed) -> Path | None:
@@ -173,18 +146,6 @@ def _names(file: Path, paths: list[Path]) -> tuple[str, ...]:
     return tuple("_".join(p.parts) for p in inner)
 
 
-def _matrix(frame: dict[str, Any], file: Path) -> NDArray[np.float64]:
-    try:
-        matrix = np.array(frame.get("transform_matrix"), dtype=np.float64)
-    except (TypeError, ValueError):
-        matrix = np.zeros(0)
-    if matrix.shape == (3, 4):
-        matrix = np.vstack([matrix, [0, 0, 0, 1]])
-    if matrix.shape != (4, 4):
-        raise InputError(f"{file}: frame {frame.get('file_path')!r} has no 4x4 transform_matrix: add it")
-    return matrix
-
-
 def _camera(
     table: dict[str, Any], frames: list[dict[str, Any]], file: Path, image: Path
 ) -> tuple[Camera | None, tuple[str, ...]]:
@@ -198,14 +159,11 @@ def _camera(
         )
     actual = image_size(image)
     width, height = (int(optional_number(values, file, key) or size) for key, size in zip("wh", actual, strict=True))
-    fx, fy = (
-        _focal(values, file, "fl_x", "camera_angle_x", width),
-        _focal(values, file, "fl_y", "camera_angle_y", height),
-    )
+    fx = _focal(values, file, "fl_x", "camera_angle_x", width)
+    fy = _focal(values, file, "fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
-        if not notes:
-            notes = (f"{file.name} states no focal length (fl_x or camera_angle_x): it is found from the images",)
-        return None, notes
+        missing = f"{file.name} states no focal length (fl_x or camera_angle_x): it is found from the images"
+        return None, notes or (missing,)
     cx, cy = (optional_number(values, file, key) for key in ("cx", "cy"))
     center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
     fisheye = model == "OPENCV_FISHEYE" or values.get("is_fisheye") is True
@@ -215,11 +173,8 @@ def _camera(
     if unused:
         start = "" if fisheye else ": the lens is found from the images, beginning with the stated focal length"
         notes = (*notes, f"the coefficients {', '.join(unused)} of {file.name} are not supported here{start}")
-    distortion = distortion if any(distortion[4:]) else distortion[:4]
-    camera = Camera(
-        width, height, fx or fy or 0.0, fy or fx or 0.0, *center, distortion, fisheye,
-        is_nominal=bool(unused) and not fisheye,
-    )  # fmt: skip
+    distortion, nominal = distortion if any(distortion[4:]) else distortion[:4], bool(unused) and not fisheye
+    camera = Camera(width, height, fx or fy or 0.0, fy or fx or 0.0, *center, distortion, fisheye, nominal)
     return camera.resized(*actual), notes
 
 
@@ -259,16 +214,11 @@ def _shared_intrinsics(
 
 def write_transforms(
     path: Path,
-    width: int,
-    height: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    image_paths: tuple[str, ...] | list[str],
+    camera: Camera,
+    image_paths: Sequence[str],
     world_from_cam: NDArray[np.float64],
     ply_path: str | None = None,
-    mask_paths: tuple[str, ...] | list[str] = (),
+    mask_paths: Sequence[str] = (),
 ) -> None:
     """Write a transforms.json of one pinhole camera.
 
@@ -282,21 +232,13 @@ def write_transforms(
             f"write_transforms: got {len(image_paths)} images, {len(mask_paths)} masks, poses {world_from_cam.shape}"
         )
     masks = [{"mask_path": name} for name in mask_paths] or [{}] * len(image_paths)
-    matrices = world_from_cam @ OPENCV_FROM_OPENGL
+    names = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx}
     table: dict[str, object] = {
-        "camera_model": "OPENCV",
-        "w": width,
-        "h": height,
-        "fl_x": float(fx),
-        "fl_y": float(fy),
-        "cx": float(cx),
-        "cy": float(cy),
-        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+        "camera_model": "OPENCV", **names, "cy": camera.cy, **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
         "frames": [
             {"file_path": name, **mask, "transform_matrix": matrix.tolist()}
-            for name, mask, matrix in zip(image_paths, masks, matrices, strict=True)
+            for name, mask, matrix in zip(image_paths, masks, world_from_cam @ OPENCV_FROM_OPENGL, strict=True)
         ],
-    }
-    if ply_path is not None:
-        table["ply_file_path"] = ply_path
-    write_text(path, json.dumps(table, indent=1, allow_nan=False) + "\n")
+        **({} if ply_path is None else {"ply_file_path": ply_path}),
+    }  # fmt: skip
+    write_json(path, table)

@@ -1,5 +1,6 @@
 """ScanNet: scenes as color/, depth/, pose/, intrinsic/ and label-filt/, and the .sens files they are exported from."""
 
+import itertools
 import struct
 import zlib
 from dataclasses import dataclass
@@ -10,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..image_folder import list_images
+from ..image_folder import frame_number, list_images, read_image_times
 from ..images import MAX_IMAGE_PIXELS, decode_rgb, first_readable, image_size
-from ..reading import opened, require_file
-from ..textfile import read_table
-from ..trajectory import clean_poses, read_matrices
-from .matching import classes_found, files_for_images, sequence_of, times_at_sensor_rate
-from .sequence import Camera, Dataset, LabelClass, find_label_table, read_nyu40_classes
+from ..reading import opened, parsing, require_file
+from ..trajectory import clean_poses
+from .benchmarks import calibration_matrix, pose_in
+from .folder import SENSOR_RATE, classes_of, files_for_images, sequence_of
+from .sequence import Camera, Dataset, find_label_table, read_nyu40_classes
 
 _VERSION = 4
 _JPEG, _PNG = 2, 1
@@ -27,11 +28,6 @@ _MICROSECONDS = 1e-6
 
 _LABEL_FOLDERS = ("label-filt", "label")
 _COLOR_SIZE, _DEPTH_SIZE = (1296, 968), (640, 480)
-
-
-def is_scannet(path: Path) -> bool:
-    """Recognise color/ and pose/ with one text file a frame."""
-    return (path / "color").is_dir() and (path / "pose").is_dir() and any((path / "pose").glob("*.txt"))
 
 
 def open_scannet(path: Path) -> Dataset:
@@ -45,29 +41,33 @@ def open_scannet(path: Path) -> Dataset:
     label_paths = files_for_images(images, label_folder)
     depth_paths = files_for_images(images, path / "depth")
     first_depth = next((p for p in depth_paths if p is not None), None)
+    table = find_label_table(path) if label_paths else None
     return sequence_of(
         "scannet", path, images,
-        timestamps=times_at_sensor_rate(images),
+        timestamps=_times(images),
         camera=_camera(path / "intrinsic" / "intrinsic_color.txt", first_readable(images), _COLOR_SIZE),
-        world_from_cam=np.stack([_pose(path / "pose" / f"{p.stem}.txt") for p in images]),
+        world_from_cam=np.stack([pose_in(path / "pose" / f"{p.stem}.txt") for p in images]),
         depth_paths=depth_paths,
         depth_camera=_camera(path / "intrinsic" / "intrinsic_depth.txt", first_depth, _DEPTH_SIZE),
         label_paths=label_paths,
-        classes=_classes(path, label_paths),
+        classes=classes_of(label_paths, None) if table is None else read_nyu40_classes(table),
     )  # fmt: skip
 
 
-def _pose(path: Path) -> NDArray[np.float64]:
-    return read_matrices(path)[0] if path.is_file() else np.full((4, 4), np.nan)
+def _times(images: list[Path]) -> NDArray[np.float64]:
+    """The images' own times, else their frame numbers (else their order) over the sensor's rate."""
+    times = read_image_times(images)
+    if times is not None:
+        return times
+    numbers = [frame_number(p) for p in images]
+    if not all(a is not None and b is not None and a < b for a, b in itertools.pairwise([-1, *numbers])):
+        numbers = list(range(len(images)))
+    return np.array(numbers, dtype=np.float64) / SENSOR_RATE
 
 
 def _camera(path: Path, image: Path | None, recorded_size: tuple[int, int]) -> Camera | None:
-    if image is None or not path.is_file():
-        return None
-    k = read_table(path, 3)
-    if len(k) < 3:
-        raise InputError(f"{path} has {len(k)} rows, expected a 3x3 or 4x4 calibration matrix")
-    return scaled_camera(k, recorded_size, image_size(image))
+    known = image is not None and path.is_file()
+    return scaled_camera(calibration_matrix(path), recorded_size, image_size(image)) if known and image else None
 
 
 def scaled_camera(k: NDArray[np.float64], recorded: tuple[int, int], actual: tuple[int, int]) -> Camera:
@@ -78,58 +78,33 @@ def scaled_camera(k: NDArray[np.float64], recorded: tuple[int, int], actual: tup
     """
     fits = abs(k[0, 2] / actual[0] - 0.5) < 0.15 and abs(k[1, 2] / actual[1] - 0.5) < 0.15
     width, height = actual if fits else recorded
-    values = float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])
-    return Camera.from_integer_centres(width, height, *values).resized(*actual)
-
-
-def _classes(path: Path, label_paths: tuple[Path | None, ...]) -> tuple[LabelClass, ...]:
-    if not label_paths:
-        return ()
-    table = find_label_table(path)
-    return classes_found(label_paths) if table is None else read_nyu40_classes(table)
-
-
-@dataclass(frozen=True)
-class _Header:
-    color_matrix: NDArray[np.float64]
-    depth_matrix: NDArray[np.float64]
-    depth_kind: int
-    color_size: tuple[int, int]
-    depth_size: tuple[int, int]
-    depth_shift: float
-    frame_count: int
+    fx, fy, cx, cy = (float(k[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return Camera(width, height, fx, fy, cx + 0.5, cy + 0.5).resized(*actual)
 
 
 @dataclass(frozen=True)
 class SensFrames:
-    """Frames of a .sens file: offsets in the file of each one's colour and depth (N,), and their lengths."""
+    """Frames of a .sens file: in `index` a row (N, 3) for each of the offset of its colour, the length of that, and the
+    length of the depth that follows."""
 
     path: Path
     depth_kind: int
     depth_size: tuple[int, int]
-    starts: NDArray[np.int64]
-    color_bytes: NDArray[np.int64]
-    depth_bytes: NDArray[np.int64]
+    index: NDArray[np.int64]
 
-    def rgb(self, index: int) -> NDArray[np.uint8]:
+    def rgb(self, number: int) -> NDArray[np.uint8]:
         """Return (H, W, 3) uint8. Raises InputError for a damaged frame."""
-        data = self._read(int(self.starts[index]), int(self.color_bytes[index]))
-        return decode_rgb(data, f"frame {index} of {self.path}")
+        start, length, _ = self.index[number].tolist()
+        return decode_rgb(self._read(start, length), f"frame {number} of {self.path}")
 
-    def raw_depth(self, index: int) -> NDArray[np.uint16]:
+    def raw_depth(self, number: int) -> NDArray[np.uint16]:
         """Return (h, w) uint16. Raises InputError for a damaged frame."""
-        width, height = self.depth_size
-        start = int(self.starts[index] + self.color_bytes[index])
-        data = self._read(start, int(self.depth_bytes[index]))
-        if self.depth_kind == _ZLIB_DEPTH:
-            try:
-                # A limit, because a few bytes of zlib can unpack to gigabytes.
+        (width, height), (start, before, length) = self.depth_size, self.index[number].tolist()
+        data = self._read(start + before, length)
+        with parsing(self.path, f"depth of frame {number}", "copy it again"):
+            if self.depth_kind == _ZLIB_DEPTH:  # a limit, because a few bytes can unpack to gigabytes
                 data = zlib.decompressobj().decompress(data, width * height * 2)
-            except zlib.error as error:
-                raise InputError(f"{self.path}: depth of frame {index} is damaged ({error}): copy it again") from error
-        if len(data) != width * height * 2:
-            raise InputError(f"{self.path}: depth of frame {index} is damaged: copy the file again")
-        return np.frombuffer(data, dtype="<u2").reshape(height, width).astype(np.uint16)
+            return np.frombuffer(data, dtype="<u2").reshape(height, width).astype(np.uint16)
 
     def _read(self, start: int, length: int) -> bytes:
         with opened(self.path) as file:
@@ -144,47 +119,39 @@ def open_sens(path: Path) -> Dataset:
     """
     size = require_file(path)
     with opened(path) as file:
-        header = _read_header(file, path)
-        index, poses, times = _read_index(file, path, header.frame_count, size)
-    frames = SensFrames(path, header.depth_kind, header.depth_size, *index)
-    count = header.frame_count
+        version, name_bytes = _unpack(file, "<IQ", path)
+        if version != _VERSION or name_bytes > _MAX_NAME_BYTES:
+            raise InputError(f"{path} is no .sens file of version {_VERSION}: check that it is the right file")
+        file.seek(name_bytes, 1)
+        color_matrix, _, depth_matrix, _ = np.array(_unpack(file, "<64f", path), np.float64).reshape(4, 4, 4)
+        color_kind, depth_kind, width, height, depth_width, depth_height, shift, count = _unpack(file, "<2i4IfQ", path)
+        if color_kind not in (_PNG, _JPEG) or depth_kind not in (_RAW_DEPTH, _ZLIB_DEPTH):
+            raise InputError(
+                f"{path} has colour compression {color_kind} and depth compression {depth_kind}, which cannot be read "
+                "here: export it to a folder with ScanNet's own tool"
+            )
+        if max(width * height, depth_width * depth_height) > MAX_IMAGE_PIXELS or not shift > 0:
+            raise InputError(f"{path} has a damaged header (images of {width}x{height}): copy it again")
+        index, poses, times = _read_index(file, path, count, size)
     increasing = bool((np.diff(times) > 0).all() and times[-1] > times[0])
+    color_size, depth_size = (width, height), (depth_width, depth_height)
     return Dataset(
         format="sens",
         root=path,
         names=tuple(f"{i:06d}.jpg" for i in range(count)),
         timestamps=(times - times[0]) * _MICROSECONDS if increasing else None,
-        camera=scaled_camera(header.color_matrix, header.color_size, header.color_size),
+        camera=scaled_camera(color_matrix, color_size, color_size),
         world_from_cam=clean_poses(poses, str(path)),
-        depth_camera=scaled_camera(header.depth_matrix, header.depth_size, header.depth_size),
-        depth_per_metre=header.depth_shift,
-        store=frames,
-    )
-
-
-def _read_header(file: BinaryIO, path: Path) -> _Header:
-    version, name_bytes = _unpack(file, "<IQ", path)
-    if version != _VERSION or name_bytes > _MAX_NAME_BYTES:
-        raise InputError(f"{path} is no .sens file of version {_VERSION}: check that it is the right file")
-    file.seek(name_bytes, 1)
-    matrices = np.array(_unpack(file, "<64f", path), dtype=np.float64).reshape(4, 4, 4)
-    color_kind, depth_kind, *sizes, shift, count = _unpack(file, "<2i4IfQ", path)
-    if color_kind not in (_PNG, _JPEG) or depth_kind not in (_RAW_DEPTH, _ZLIB_DEPTH):
-        raise InputError(
-            f"{path} has colour compression {color_kind} and depth compression {depth_kind}, which cannot be read "
-            "here: export it to a folder with ScanNet's own tool"
-        )
-    if sizes[0] * sizes[1] > MAX_IMAGE_PIXELS or sizes[2] * sizes[3] > MAX_IMAGE_PIXELS or not shift > 0:
-        raise InputError(f"{path} has a damaged header (images of {sizes}): copy it again")
-    return _Header(
-        matrices[0], matrices[2], depth_kind, (sizes[0], sizes[1]), (sizes[2], sizes[3]), float(shift), count
+        depth_camera=scaled_camera(depth_matrix, depth_size, depth_size),
+        depth_per_metre=float(shift),
+        store=SensFrames(path, depth_kind, depth_size, index),
     )
 
 
 def _read_index(
     file: BinaryIO, path: Path, count: int, size: int
-) -> tuple[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64], NDArray[np.float64]]:
-    """(starts, colour bytes, depth bytes) of each frame, poses (N, 4, 4) and times (N,) as stored."""
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """The index of `SensFrames`, poses (N, 4, 4) and times (N,) as stored."""
     if count < 1 or count * _FRAME_HEAD.size > size:
         raise InputError(f"{path} declares {count} frames in {size / 1e6:.1f} MB: it is damaged, copy it again")
     rows, poses, times = [], [], []
@@ -197,9 +164,7 @@ def _read_index(
         poses.append(matrix)
         times.append(color_time)
         file.seek(color_bytes + depth_bytes, 1)
-    columns = np.array(rows, dtype=np.int64).T
-    stored = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
-    return (columns[0], columns[1], columns[2]), stored, np.array(times, dtype=np.float64)
+    return np.array(rows, np.int64), np.array(poses, np.float64).reshape(-1, 4, 4), np.array(times, np.float64)
 
 
 def _unpack(file: BinaryIO, layout: str, path: Path) -> tuple:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,16 +52,6 @@ class LabelClass:
         return self.name.strip().lower() in _VOID_NAMES
 
 
-class FrameStore(Protocol):
-    """Frames stored in one container file instead of a folder."""
-
-    def rgb(self, index: int) -> NDArray[np.uint8]:
-        """Return (H, W, 3) uint8."""
-
-    def raw_depth(self, index: int) -> NDArray[np.uint16]:
-        """Return (H, W) uint16 in the container's unit."""
-
-
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """N frames of one camera.
@@ -93,30 +82,29 @@ class Dataset:
     label_paths: tuple[Path | None, ...] = ()
     mask_paths: tuple[Path | None, ...] = ()
     classes: tuple[LabelClass, ...] = ()
-    store: FrameStore | None = field(default=None, repr=False)
+    store: Any = field(default=None, repr=False)
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        n = len(self.names)
+        n, times, poses = len(self.names), self.timestamps, self.world_from_cam
         if n == 0:
             raise InputError(f"no frames in {self.root}: check that the data set was unpacked completely")
         if len(set(self.names)) != n:
             raise InputError(f"{self.root}: two frames have the same file name: rename one")
-        if self.timestamps is not None and not _is_increasing(self.timestamps, n):
+        if times is not None and not (times.shape == (n,) and np.isfinite(times).all() and (np.diff(times) > 0).all()):
             raise InputError(f"{self.root}: the frames' timestamps do not increase: sort the image list by time")
-        if not _UNITS_PER_METRE[0] <= self.depth_per_metre <= _UNITS_PER_METRE[1]:
+        low, high = _UNITS_PER_METRE
+        if not low <= self.depth_per_metre <= high:
             raise InputError(
                 f"{self.root}: a depth scale of {self.depth_per_metre:g} units a metre cannot be: correct it"
             )
-        for what in ("image_paths", "depth_paths", "label_paths", "mask_paths"):
-            if len(getattr(self, what)) not in (0, n):
-                raise ValueError(f"Sequence: {len(getattr(self, what))} {what} for {n} frames")
-        if self.world_from_cam is not None and self.world_from_cam.shape != (n, 4, 4):
-            raise ValueError(f"Sequence: {n} frames and poses of shape {self.world_from_cam.shape}")
         if len(self.classes) >= VOID_LABEL:
             raise InputError(f"{self.root} has {len(self.classes)} classes, at most {VOID_LABEL - 1} are supported")
-        if not self.image_paths and self.store is None:
-            raise ValueError("Sequence: neither image_paths nor a store")
+        for paths in (self.image_paths, self.depth_paths, self.label_paths, self.mask_paths):
+            if len(paths) not in (0, n) or not (self.image_paths or self.store):
+                raise ValueError(f"Dataset: {len(paths)} paths for {n} frames")
+        if poses is not None and poses.shape != (n, 4, 4):
+            raise ValueError(f"Dataset: {n} frames and poses of shape {poses.shape}")
 
     def __len__(self) -> int:
         return len(self.names)
@@ -133,7 +121,7 @@ class Dataset:
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """Names in the order of the indices that `labels` gives."""
+        """Names by the indices that `labels` gives."""
         return tuple(c.name for c in self.classes)
 
     @property
@@ -154,8 +142,11 @@ class Dataset:
         Depth of another camera is moved to the colour camera's pixels; the few centimetres between the two lenses
         are left out, as these data sets do not state them.
         """
-        raw = self._raw_depth(index)
-        if raw is None:
+        if self.store is not None:
+            raw = self.store.raw_depth(index)
+        elif self.depth_paths and (path := self.depth_paths[index]) is not None:
+            raw = read_depth_png(path)
+        else:
             return None
         depth = raw.astype(np.float32) / np.float32(self.depth_per_metre)
         depth[np.isin(raw, self.depth_invalid)] = 0
@@ -170,27 +161,9 @@ class Dataset:
         if path is None:
             return None
         table = np.full(65536, VOID_LABEL, dtype=np.uint8)
-        for index, label_class in enumerate(self.classes):
-            table[[label_class.id, *label_class.other_ids]] = index
+        for number, label_class in enumerate(self.classes):
+            table[[label_class.id, *label_class.other_ids]] = number
         return table[read_label_png(path)]
-
-    def _raw_depth(self, index: int) -> NDArray[np.uint16] | None:
-        if self.store is not None:
-            return self.store.raw_depth(index)
-        path = self.depth_paths[index] if self.depth_paths else None
-        return None if path is None else read_depth_png(path)
-
-
-def _is_increasing(times: NDArray[np.float64], count: int) -> bool:
-    return times.shape == (count,) and bool(np.isfinite(times).all() and (np.diff(times) > 0).all())
-
-
-def used_label_ids(paths: Iterable[Path]) -> set[int]:
-    """Return all ids that occur in these label images."""
-    seen = np.zeros(65536, dtype=bool)
-    for path in paths:
-        seen[read_label_png(path).ravel()] = True
-    return {int(i) for i in np.flatnonzero(seen)}
 
 
 def distortion_names(fisheye: bool) -> tuple[str, ...]:
@@ -232,37 +205,20 @@ class Camera:
         """Whether an ideal pinhole camera would see another image."""
         return any(self.distortion)
 
-    @classmethod
-    def from_integer_centres(
-        cls,
-        width: int,
-        height: int,
-        fx: float,
-        fy: float,
-        cx: float,
-        cy: float,
-        distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0),
-    ) -> Camera:
-        """Make a camera from a calibration in which the first pixel's centre is (0, 0), as in OpenCV and ROS."""
-        return cls(width, height, fx, fy, cx + 0.5, cy + 0.5, distortion)
-
     def resized(self, width: int, height: int) -> Camera:
         """Return the camera after its image is resized to width x height.
 
         Raises InputError for images of another shape, by more than 1 % and a pixel of rounding: no resizing makes one
         of the other.
         """
-        sx, sy = width / self.width, height / self.height
-        if abs(width * self.height - height * self.width) > max(
-            _SAME_SHAPE * width * self.height, self.width, self.height, width, height
-        ):
+        rounding = max(_SAME_SHAPE * width * self.height, self.width, self.height, width, height)
+        if abs(width * self.height - height * self.width) > rounding:
             raise InputError(
                 f"the camera is for images of {self.width}x{self.height}, these are {width}x{height}, another shape: "
                 "is it another camera's file, or are the images cropped or turned?"
             )
-        return replace(
-            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
-        )
+        x, y = width / self.width, height / self.height
+        return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
 
 def warp_nearest(image: NDArray[np.float32], source: Camera, target: Camera) -> NDArray[np.float32]:

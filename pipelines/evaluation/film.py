@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ...formats.errors import InputError, install_extra
 from ...formats.images import write_rgb
 from ...formats.textfile import number, read_json_object
-from ...formats.video_writer import CODECS, PLAYED, write_browser_video, write_video
+from ...formats.video_streams import CODECS, PLAYED, write_browser_video, write_video
 from ..export.web_page import EXPORTED, RUN
 from ..outcome import Outcome, load_outcome
 from ..run.folder import RunFolder

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...formats.atomic import write_text
 from ...formats.datasets.sequence import distortion_names
-from ...formats.mesh import read_textured_glb
+from ...formats.glb import read_textured_glb
 from ...formats.reading import read_bytes
 from ...formats.textfile import read_json, read_text
 from ..config import Config, config_to_dict
@@ -24,7 +24,7 @@ from ..run.files import FIGURES, LOOPS
 from ..run.folder import RunFolder, load_source
 from ..run.target import LIST, Target
 from ..scene.world import WORLD, in_world
-from ..source.sharpness import at_most_wide
+from ..source.picking import at_most_wide
 from ..system.progress import Progress, SilentProgress
 from ..system.wording import figure_text, quoted
 from ..types import VOID, LoopEdge

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...formats.mesh import TexturedMesh
+from ...formats.glb import TexturedMesh
 from ..compute.raster import draw_faces
 from ..outcome import Exposure, Outcome, labels_of_channels, spread_sample
 from ..providers import class_colors

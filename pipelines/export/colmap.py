@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...formats.atomic import copy_file
 from ...formats.colmap import ColmapModel, write_colmap_model
 from ...formats.datasets.nerfstudio import write_transforms
+from ...formats.datasets.sequence import Camera
 from ...formats.errors import InputError
 from ...formats.images import write_rgb
 from ...formats.ply import write_point_ply
@@ -30,8 +31,8 @@ from ..run.files import LEFT_OUT
 from ..run.folder import load_source
 from ..run.target import Target
 from ..sfm.lens import Lens, distorted_camera, make_lens, to_pycolmap
+from ..source.picking import reduce_image, reduced_size
 from ..source.recording import Recording, open_recording
-from ..source.sharpness import reduce_image, reduced_size
 from ..system.parallel import parallel_map
 from ..system.wording import stretches
 from ..types import Frame, Intrinsics
@@ -80,7 +81,7 @@ def write_colmap(scene: ExportScene, target: Target) -> None:
     if start:
         write_point_ply(target.folder / start, points, colors)
     paths, transforms = [f"{IMAGES}/{name}" for name in names], target.path("transforms.json")
-    write_transforms(transforms, *camera, paths, trajectory.world_from_cam[posed], start, masks)
+    write_transforms(transforms, Camera(*camera), paths, trajectory.world_from_cam[posed], start, masks)
 
 
 def write_trajectory(scene: ExportScene, target: Target) -> None:

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ...formats.mesh import mesh_blocks, read_mesh_ply, write_mesh_glb, write_mesh_ply, write_textured_glb
+from ...formats.glb import write_mesh_glb, write_textured_glb
+from ...formats.ply import mesh_blocks, read_mesh_ply, write_mesh_ply
 from ..compute.threads import get_threads, host_threads
 from ..config import ExportConfig
 from ..geometry.camera import resample_nearest, unproject_depth

@@ -10,9 +10,9 @@ from scipy.spatial import ConvexHull, QhullError
 
 from ...formats.atomic import atomic_path, require_room
 from ...formats.errors import InputError, install_extra
-from ...formats.glb import Part, linear, material, write_primitive
+from ...formats.glb import Part, TexturedMesh, linear, material, write_primitive
 from ...formats.images import write_rgb
-from ...formats.mesh import MeshArrays, TexturedMesh
+from ...formats.ply import MeshArrays
 from ..run.target import Target
 from ..types import Array
 from .scene import ExportScene

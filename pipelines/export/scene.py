@@ -7,8 +7,9 @@ import numpy as np
 from torch import Tensor
 
 from ...formats.errors import InputError
-from ...formats.gaussians import GaussianCloud
-from ...formats.mesh import MeshArrays, TexturedMesh, read_mesh_ply, read_textured_glb
+from ...formats.glb import TexturedMesh, read_textured_glb
+from ...formats.ply import MeshArrays, read_mesh_ply
+from ...formats.splats import GaussianCloud
 from ..config import ExportConfig
 from ..networks.registry import metric_card
 from ..outcome import Outcome, map_cloud

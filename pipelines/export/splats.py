@@ -13,12 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.atomic import require_room
-from ...formats.gaussians import GaussianCloud, isotropic_cloud
-from ...formats.glb import COMPRESSION, EXTENSION, write_compressed_glb, write_gaussian_glb
 from ...formats.gps import ecef_from_enu
-from ...formats.ply import write_gaussian_ply
-from ...formats.sog import write_sog
-from ...formats.spz import write_spz
+from ...formats.splats import (
+    COMPRESSION,
+    EXTENSION,
+    GaussianCloud,
+    isotropic_cloud,
+    write_compressed_glb,
+    write_gaussian_glb,
+    write_gaussian_ply,
+    write_sog,
+    write_spz,
+)
 from ...formats.textfile import write_json
 from ..run.target import Target
 from ..scene.world import Z_UP_FROM_Y_DOWN

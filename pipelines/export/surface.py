@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from ...formats.mesh import MeshArrays, MeshBlocks
+from ...formats.ply import MeshArrays, MeshBlocks
 from ..geometry.camera import project
 from ..geometry.posed_depth import PosedDepth
 from ..system.jit import kernel

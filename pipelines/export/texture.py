@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.spatial import cKDTree
 
-from ...formats.mesh import MeshArrays, TexturedMesh
+from ...formats.glb import TexturedMesh
+from ...formats.ply import MeshArrays
 from ..compute.raster import draw_faces
 from ..compute.threads import for_each
 from ..geometry.camera import resample_nearest

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.sog import morton_codes
+from ...formats.splats import morton_codes
 from ..compute.threads import for_each, fused_kernel, get_threads
 from ..geometry.camera import unproject_depth
 from ..geometry.posed_depth import PosedDepth

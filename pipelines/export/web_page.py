@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.atomic import require_room, write_text
-from ...formats.gaussians import GaussianCloud
-from ...formats.sog import morton_order
+from ...formats.splats import GaussianCloud, morton_order
 from ..geometry.camera import rig_of
 from ..outcome import Outcome, map_cloud, spread_sample
 from ..run.folder import RunFolder

@@ -10,9 +10,9 @@ from ...formats.image_folder import hint_at_inner_folder
 from ..config import Config
 from ..run.files import CALIBRATION
 from ..run.folder import RunFolder, load_records
+from ..source.files import Warn
 from ..source.given import check_poses, read_intrinsics
 from ..source.recording import FolderRecording, Recording, open_recording
-from ..source.videos import Warn
 from ..system.machine import window_size, windows_of
 from .learned import open_learned
 from .masks import check_masks

@@ -17,9 +17,8 @@ from ..config import FramesConfig
 from ..run.stages import StageContext
 from ..sfm.flow import find_corners, follow
 from ..source.faces import Faces
-from ..source.overlap import Motion
+from ..source.picking import Motion, reduce_image, sharpest_of_windows, sharpness
 from ..source.recording import Recording
-from ..source.sharpness import reduce_image, sharpest_of_windows, sharpness
 from ..types import Frame
 
 PICKED, LOSSLESS = "picked", "lossless"

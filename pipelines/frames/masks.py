@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError
-from ...formats.image_folder import frame_number, natural_key
+from ...formats.image_folder import frame_number, match_names, natural_key
 from ...formats.images import image_size, read_rgb, to_grey
-from ...formats.names import match_names
 from ...formats.reading import note_read
 from ...formats.textfile import read_json, write_json
 from ..config import Config

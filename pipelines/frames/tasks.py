@@ -20,8 +20,8 @@ from ..sfm.rolling import frame_interval
 from ..sfm.snapshots import Snapshots, features_name
 from ..source.faces import Faces, find_faces
 from ..source.given import given_poses, read_intrinsics
+from ..source.picking import reduced_size
 from ..source.recording import Recording, open_recording
-from ..source.sharpness import reduced_size
 from ..system.machine import window_size
 from ..system.progress import Progress
 from ..types import Features, Frame, GivenPoses

@@ -25,8 +25,8 @@ from ..sfm.adjust import FEATURE_SD
 from ..sfm.lens import distorted_camera, make_lens, to_pycolmap
 from ..sfm.rolling import Shutter, velocities
 from ..source.faces import find_faces
+from ..source.picking import reduce_image
 from ..source.recording import Recording, open_recording
-from ..source.sharpness import reduce_image
 from ..system.progress import is_asked
 from ..system.values import load_value, save_value
 from ..system.wording import stretches

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..source.sharpness import reduce_image
+from ..source.picking import reduce_image
 
 SAMPLED = 60
 """Frames of a recording, evenly spaced."""

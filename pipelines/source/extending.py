@@ -20,8 +20,8 @@ from ..run.files import CALIBRATION, TRAJECTORY
 from ..run.folder import RunFolder, load_records, load_source
 from ..run.manifest import Manifest, Source, write_manifest
 from ..system.wording import quoted
+from .files import require_different, video_files
 from .recording import DatasetRecording, open_recording
-from .videos import require_different, video_files
 
 _FINAL = "global_ba"
 _POSES = "poses.txt"
@@ -49,21 +49,22 @@ def is_added(run: RunFolder, videos: Sequence[Path]) -> bool:
 def require_extendable(run: RunFolder, videos: Sequence[Path], config: Config) -> None:
     """Raise InputError where the run cannot be extended by these videos; nothing is written."""
     source = Path(load_source(run).path)
-    _require_plain_videos(run, source, config)
     done, needed = load_records(run), STAGES[: STAGES.index(_FINAL) + 1]
     unfinished = [s for s in needed if s not in done or run.damaged(s)]
+    made = {
+        "with --poses": bool(config.frames.poses),
+        f"from {source}, no video": source.is_dir()
+        or isinstance(open_recording(source, config.run.format), DatasetRecording),
+        "with --method paper": config.run.method == "paper",
+        "from panoramas": not unfinished and run.load(CALIBRATION).directions > 1,
+    }
+    if odd := next((how for how, holds in made.items() if holds), None):
+        raise InputError(
+            f"{run.root} was made {odd}: only runs of ordinary videos without given poses are extended. Reconstruct "
+            f"all of it into another folder, with --poses {quoted(run.path('export', 'sparse', '0'))}"
+        )
     if unfinished:
         raise InputError(f"{run.root}: {unfinished[0]} is not done. Run `msgs-slam resume {quoted(run.root)}` first")
-    if run.load(CALIBRATION).directions > 1:
-        raise InputError(
-            f"{run.root} was made from panoramas, and only a run of ordinary videos can be extended: reconstruct "
-            "all the recordings together, in a new run"
-        )
-    if config.run.method == "paper":
-        raise InputError(
-            f"{run.root} was made with --method paper, which starts from no given poses: reconstruct all the videos "
-            "together, in a new run"
-        )
     require_different(videos)
     require_listable(videos)
     known = video_files(source)
@@ -94,17 +95,6 @@ def add_videos(run: RunFolder, videos: Sequence[Path], config: Config) -> Source
     for old in earlier:
         shutil.rmtree(old, ignore_errors=True)
     return source
-
-
-def _require_plain_videos(run: RunFolder, source: Path, config: Config) -> None:
-    is_set = source.is_dir() or isinstance(open_recording(source, config.run.format), DatasetRecording)
-    if not (is_set or config.frames.poses):
-        return
-    why = "with --poses" if config.frames.poses else f"from {source}, no video"
-    raise InputError(
-        f"{run.root} was made {why}: only runs of videos without given poses are extended. Reconstruct all of it into "
-        f"another folder, with --poses {quoted(run.path('export', 'sparse', '0'))}"
-    )
 
 
 def _size(video: Path) -> tuple[int, int]:

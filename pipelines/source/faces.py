@@ -19,8 +19,8 @@ from ..geometry.camera import CUBE, LEVEL
 from ..sfm.lens import make_lens, to_pycolmap
 from ..types import Intrinsics
 from .given import read_intrinsics
+from .picking import reduced_size
 from .recording import FolderRecording, Recording, VideoRecording
-from .sharpness import reduced_size
 
 Pixel = TypeVar("Pixel", np.uint8, np.bool_)
 Map = tuple[NDArray[np.float32], NDArray[np.float32]]

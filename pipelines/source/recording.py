@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from ...formats.datasets import Camera, Dataset, open_sequence, recognise_source
 from ...formats.errors import InputError
-from ...formats.image_folder import list_images, read_image_times, times_file, unread_images
+from ...formats.image_folder import list_images, read_image_times, times_file, unused_pictures
+from ...formats.image_tags import ExifLens
 from ...formats.images import Header, Reading, is_depth_map, is_plain, read_rgb, read_transparent
 from ...formats.reading import (
     LONGEST_NAME,
@@ -27,15 +28,14 @@ from ...formats.reading import (
     is_plain_name,
     known_sha256,
     noting_files,
-    opened,
     reaching,
     require_file,
 )
 from ...formats.video import VideoFrame, VideoReader, probe_video
+from ...formats.video_head import read_equivalent
 from ..run.folder import RunFolder
 from ..run.reads import cover_files
-from .headers import Headers, common_span, read_headers, require_one_lens
-from .videos import Warn, common_focal, video_files, warn_of_video
+from .files import Headers, Warn, common_span, read_headers, require_one_lens, video_files, warn_of_video
 
 WRITTEN_SUFFIXES = (".jpg", ".jpeg", ".png")
 
@@ -43,10 +43,6 @@ _PAUSE = 10.0
 """Seconds on the clock of the run between two videos: no velocity goes on from one to the next."""
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 """Begins an address; a path has lost one of its slashes."""
-_ARCHIVE_HEADS = (
-    b"PK\3\4", b"\x1f\x8b", b"BZh", b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07", b"\xfd7zXZ\0", b"\x28\xb5\x2f\xfd",
-)  # fmt: skip
-_TAR_MARK_AT = 257
 
 
 class Recording(ABC):
@@ -127,20 +123,18 @@ def open_recording(path: Path, format: str = "auto") -> Recording:
     with noting_files() as files:
         require_source(path)
         if (known := _opened.get(key)) is None or not known[0].are_current():
-            recording = _open(path, format)
+            found = recognise_source(path) if format == "auto" else format
+            recording: Recording
+            if found is not None and found != "images":
+                recording = DatasetRecording(open_sequence(path, found))
+            else:
+                recording = FolderRecording(path) if path.is_dir() else VideoRecording(path)
             images = recording.sequence.image_paths if isinstance(recording, ImageRecording) else ()
             folders = [] if isinstance(recording, VideoRecording) else [path, *(file.parent for file in files)]
             _opened.clear()
             known = _opened[key] = FileStamps.of([*files, *folders]), [*files, *images], recording
     cover_files(known[1])
     return known[2]
-
-
-def _open(path: Path, format: str) -> Recording:
-    found = recognise_source(path) if format == "auto" else format
-    if found is not None and found != "images":
-        return DatasetRecording(open_sequence(path, found))
-    return FolderRecording(path) if path.is_dir() else VideoRecording(path)
 
 
 def require_source(path: Path) -> None:
@@ -153,10 +147,6 @@ def require_source(path: Path) -> None:
             next(path.iterdir(), None)
             return
     require_file(path)
-    with opened(path) as file:
-        head = file.read(_TAR_MARK_AT + 5)
-    if head.startswith(_ARCHIVE_HEADS) or head[_TAR_MARK_AT:] == b"ustar":
-        raise InputError(f"{path} is an archive: unpack it first, then give the video or the folder that was in it")
 
 
 # videos -----------------------------------------------------------------------------------------------------------
@@ -175,7 +165,6 @@ class VideoRecording(Recording):
 
     @cached_property
     def digest(self) -> str:
-        """Do as `Recording` says."""
         if self.files == (self.path,):
             return known_sha256(self.path)
         return files_sha256(((str(i), f) for i, f in enumerate(self.files)), of_file=known_sha256)
@@ -186,7 +175,7 @@ class VideoRecording(Recording):
         for file in self.files:
             with VideoReader(file, None if wanted is None else lambda i, n=first: n + i in wanted) as reader:  # type: ignore[misc]
                 for index, time, rgb in reader:
-                    _require_size(rgb, self.width, self.height, f"frame {index} of {file}")
+                    _require_size(rgb, self, f"frame {index} of {file}")
                     yield VideoFrame(first + index, start + time, rgb)
                 if warn is not None:
                     warn_of_video(file, reader, warn)
@@ -198,7 +187,8 @@ class VideoRecording(Recording):
 
     def exif_focal(self) -> float | None:
         """Do as `Recording` says: what the metadata of all files states alike."""
-        return common_focal(self.files, self.width, self.height)
+        stated = {read_equivalent(file) for file in self.files}
+        return ExifLens(equivalent=stated.pop()).focal_px(self.width, self.height) if len(stated) == 1 else None
 
 
 def is_of_source(path: Path, run: RunFolder) -> bool:
@@ -231,7 +221,6 @@ class ImageRecording(Recording):
         self.width, self.height = self._size(next(iter(self.headers.of.values())))
 
     def is_timed(self) -> bool:
-        """Do as `Recording` says."""
         return self.sequence.timestamps is not None
 
     def _of_one_size(self, headers: Headers) -> Headers:
@@ -271,7 +260,7 @@ class ImageRecording(Recording):
                 if warn is not None:
                     warn(f"left out: {error}")
                 continue
-            _require_size(rgb, self.width, self.height, f"{self.sequence.names[index]} of {self.path}")
+            _require_size(rgb, self, f"{self.sequence.names[index]} of {self.path}")
             yield VideoFrame(index, math.nan if times is None else float(times[index]), rgb)
 
     def name(self, frame_id: int, index: int) -> str:
@@ -279,28 +268,23 @@ class ImageRecording(Recording):
         return self._names[index]
 
     def place(self, index: int) -> str:
-        """Do as `Recording` says."""
         paths = self.sequence.image_paths
         return str(paths[index]) if paths else self.sequence.names[index]
 
     def masks(self) -> dict[int, Path]:
-        """Do as `Recording` says."""
         return {i: path for i, path in enumerate(self.sequence.mask_paths) if path is not None}
 
     def original(self, index: int) -> Path | None:
-        """Do as `Recording` says."""
         path = self.sequence.image_paths[index] if self.sequence.image_paths else None
         if path is None or path.suffix.lower() not in WRITTEN_SUFFIXES or not is_plain(path):
             return None
         return path if self.reading.orientation in (None, 1) else None
 
     def transparent(self, index: int) -> NDArray[np.bool_] | None:
-        """Do as `Recording` says."""
         paths = self.sequence.image_paths
         return read_transparent(paths[index], self.reading) if paths else None
 
     def exif_focal(self) -> float | None:
-        """Do as `Recording` says."""
         return self.headers.focal_px(self.width, self.height)
 
     def _rgb(self, index: int) -> NDArray[np.uint8]:
@@ -313,17 +297,17 @@ class FolderRecording(ImageRecording):
     size than the rest, are left out."""
 
     def __init__(self, path: Path) -> None:
-        """See `ImageRecording`."""
         listed = list_images(path)
-        images = _without_depth_maps(listed)
-        names, notes = tuple(image.name for image in images), _notes_on_unread(path)
+        # Some data sets keep depth beside colour, as images of 16 bits in one channel.
+        images = [p for p in listed if p.suffix.lower() not in (".png", ".tif", ".tiff") or not is_depth_map(p)]
+        images, notes = images or listed, unused_pictures(listed)
         if len(images) < len(listed):
             notes += (f"{len(listed) - len(images)} depth maps among the images are left out",)
+        names = tuple(image.name for image in images)
         super().__init__(Dataset("images", path, names, read_image_times(images), tuple(images), notes=notes))
 
     @cached_property
     def digest(self) -> str:
-        """Do as `Recording` says."""
         files = [*list_images(self.path), *filter(None, [times_file(self.path)])]
         return files_sha256(sorted((p.name, p) for p in files), of_file=known_sha256)
 
@@ -338,7 +322,6 @@ class FolderRecording(ImageRecording):
         super()._require_one_camera()
 
     def turns_from_upright(self, index: int) -> int:
-        """Do as `Recording` says."""
         return self.headers.turns_from_upright(self.sequence.names[index], self._common)
 
     def file(self, index: int) -> Path:
@@ -351,7 +334,6 @@ class DatasetRecording(ImageRecording):
 
     @cached_property
     def digest(self) -> str:
-        """Do as `Recording` says."""
         s = self.sequence
         if not s.image_paths:
             return known_sha256(self.path)
@@ -361,44 +343,21 @@ class DatasetRecording(ImageRecording):
     def _orientation(self) -> int | None:
         common, camera = super()._orientation(), self.sequence.camera
         first = next(iter(self.headers.of.values()))
-        is_turned = common is None and camera is not None and first.size != first.stored
+        if common is not None or camera is None or first.size == first.stored or camera.width == camera.height:
+            return common
         # The program that made the data set has not turned its images.
-        return 1 if is_turned and camera is not None and _is_shape_of(first.stored, camera) else common
+        return 1 if (first.stored[0] > first.stored[1]) == (camera.width > camera.height) else None
 
     def _require_one_camera(self) -> None:
         if self.sequence.camera is None:
             super()._require_one_camera()
 
     def camera(self) -> Camera | None:
-        """Do as `Recording` says."""
         camera = self.sequence.camera
         return None if camera is None else camera.resized(self.width, self.height)
 
     def dataset(self) -> Dataset:
-        """Do as `Recording` says."""
         return self.sequence
-
-
-def _is_shape_of(size: tuple[int, int], camera: Camera) -> bool:
-    """Whether images of the size (width, height) are wide or high as the camera's are."""
-    return camera.width != camera.height and (size[0] > size[1]) == (camera.width > camera.height)
-
-
-def _without_depth_maps(images: list[Path]) -> list[Path]:
-    """All but images of 16 bits in one channel, if there are others: some data sets keep depth beside colour."""
-    depth = {path for path in images if path.suffix.lower() in (".png", ".tif", ".tiff") and is_depth_map(path)}
-    return images if len(depth) == len(images) else [path for path in images if path not in depth]
-
-
-def _notes_on_unread(folder: Path) -> tuple[str, ...]:
-    unread = unread_images(folder)
-    if not unread:
-        return ()
-    kinds = ", ".join(sorted({path.suffix.lower() for path in unread}))
-    return (
-        f"{len(unread)} files of a format that is not read ({kinds}) are left out, {unread[0].name} first: export them "
-        "as JPEG or PNG",
-    )
 
 
 def written_name(name: str) -> str:
@@ -407,10 +366,8 @@ def written_name(name: str) -> str:
 
 
 def written_names(names: Iterable[str], root: Path) -> tuple[str, ...]:
-    """`written_name` of each. Raises InputError, naming the file, where a run could not keep one of them.
-
-    A run stores names as UTF-8 in JSON and in COLMAP's files, one a line, and each frame in a file of its name.
-    """
+    """`written_name` of each. Raises InputError, naming the file, where a run could not keep one of them: it stores
+    names as UTF-8 in JSON and in COLMAP's files, one a line, and each frame in a file of its name."""
     written: dict[str, str] = {}
     for name in names:
         frame = written_name(name)
@@ -430,10 +387,11 @@ def written_names(names: Iterable[str], root: Path) -> tuple[str, ...]:
 # sizes and warnings -----------------------------------------------------------------------------------------------
 
 
-def _require_size(rgb: NDArray[np.uint8], width: int, height: int, what: str) -> None:
-    if rgb.shape[:2] != (height, width):
+def _require_size(rgb: NDArray[np.uint8], source: Recording, what: str) -> None:
+    height, width = rgb.shape[:2]
+    if (width, height) != (source.width, source.height):
         raise InputError(
-            f"{what} is {rgb.shape[1]}x{rgb.shape[0]}, the images before it are {width}x{height}: convert the source "
+            f"{what} is {width}x{height}, the images before it are {source.width}x{source.height}: convert the source "
             "to one size first"
         )
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.video import VideoReader
-from msgs_slam.formats.video_writer import write_video
+from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.evaluation.report import write_report
 from msgs_slam.pipelines.evaluation.write import CLIP, VIDEO
 from msgs_slam.pipelines.export.stage import export_run

@@ -34,7 +34,7 @@ sys.path.insert(0, str(ROOT))
 
 from msgs_slam.formats.reading import file_sha256
 from msgs_slam.formats.textfile import read_json_object, write_json
-from msgs_slam.formats.video_writer import write_video
+from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.config import STAGES, Config
 from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct, resume

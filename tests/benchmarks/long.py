@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.formats.images import read_rgb
-from msgs_slam.formats.video_writer import write_video
+from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.geometry.se3 import align_points
 from msgs_slam.pipelines.run.files import BACKBONE, FRAMES

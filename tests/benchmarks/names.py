@@ -34,7 +34,7 @@ from scipy.spatial import cKDTree
 
 from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.formats.ply import read_mesh_ply
 from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.evaluation.labels import ClassMap, Matching, count_labels, match_classes, read_class_map, score
 from msgs_slam.pipelines.evaluation.truth import match_truth

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.formats.ply import read_mesh_ply
 from msgs_slam.pipelines.compute.raster import draw_faces
 from msgs_slam.pipelines.evaluation.metrics import psnr
 from msgs_slam.pipelines.outcome import load_outcome

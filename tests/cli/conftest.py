@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from cli_runs import OPTIONS, QUICK, FinishedRun, invoke
 
-from msgs_slam.formats.video_writer import write_video
+from msgs_slam.formats.video_streams import write_video
 from tests.world import iter_clip, make_world, write_sequence
 
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 from msgs_slam.formats.atomic import temporary_of
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.video_writer import write_video
+from msgs_slam.formats.video_streams import write_video
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.export.kinds import export_of

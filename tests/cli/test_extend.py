@@ -12,7 +12,7 @@ import pytest
 from cli_runs import OPTIONS, QUICK, elsewhere, files_below, invoke
 from test_kill_and_resume import digests, finish, kill_when, start, written
 
-from msgs_slam.formats.video_writer import write_video
+from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.geometry.se3 import align_points, inverse
 from msgs_slam.pipelines.run.files import MAP, TRAJECTORY

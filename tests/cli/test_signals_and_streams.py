@@ -12,7 +12,7 @@ import pytest
 from cli_runs import FinishedRun, invoke
 
 from msgs_slam.formats.errors import DiskFullError
-from msgs_slam.formats.video_writer import write_video
+from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.run import folder, runner
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.runner import forget_peak, peak_memory_mb

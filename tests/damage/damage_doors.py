@@ -30,7 +30,6 @@ from msgs_slam.formats.datasets import Camera, Dataset, open_sequence, recognise
 from msgs_slam.formats.datasets.calibration import read_intrinsics_json
 from msgs_slam.formats.datasets.sequence import read_class_table, read_nyu40_classes
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.gaussians import GaussianCloud
 from msgs_slam.formats.gps import read_track
 from msgs_slam.formats.image_folder import (
     list_images,  # fmt: skip
@@ -47,13 +46,14 @@ from msgs_slam.formats.images import (
     write_grey_png,
     write_rgb,
 )
-from msgs_slam.formats.mesh import MeshArrays, MeshBlocks, read_mesh_ply, write_mesh_ply
+from msgs_slam.formats.ply import MeshArrays, MeshBlocks, read_mesh_ply, write_mesh_ply
 from msgs_slam.formats.poses import read_poses
+from msgs_slam.formats.splats import GaussianCloud
 from msgs_slam.formats.tensors import load_arrays, load_tensors, save_arrays, save_tensors
 from msgs_slam.formats.textfile import read_toml, write_json
 from msgs_slam.formats.trajectory import read_matrices, read_tum, write_tum
 from msgs_slam.formats.video import VideoReader, probe_video
-from msgs_slam.formats.video_writer import write_video
+from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.depth.files import _read as read_depth_file
 from msgs_slam.pipelines.evaluation.labels import read_class_map
 from msgs_slam.pipelines.frames.masks import open_masks

@@ -26,16 +26,17 @@ from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.datasets.calibration import read_calibration_file, read_yaml
 from msgs_slam.formats.datasets.sequence import read_class_table, read_nyu40_classes
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.glb import read_textured_glb
 from msgs_slam.formats.gps import read_track
 from msgs_slam.formats.image_folder import read_image_times
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.mesh import read_mesh_ply, read_textured_glb
+from msgs_slam.formats.ply import read_mesh_ply
 from msgs_slam.formats.poses import read_poses
 from msgs_slam.formats.tensors import load_arrays, load_tensors
 from msgs_slam.formats.textfile import read_json, read_toml
 from msgs_slam.formats.trajectory import read_matrices, read_tum
+from msgs_slam.pipelines.source.files import video_files
 from msgs_slam.pipelines.source.recording import DatasetRecording, FolderRecording, open_recording
-from msgs_slam.pipelines.source.videos import video_files
 
 Read = Callable[[Path], Any]
 DEEP = 100_000

@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 from msgs_slam.formats.colmap import (
     ColmapModel,
     ModelArrays,
+    model_suffix,
     pose_of,
     read_colmap_model,
     set_pose,
     write_colmap_model,
 )
-from msgs_slam.formats.colmap_files import model_suffix
 from msgs_slam.formats.errors import InputError
 from tests.colmap_models import posed_images
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from msgs_slam.formats.datasets import VOID_LABEL, Camera, Dataset, open_sequence, recognise
-from msgs_slam.formats.datasets.matching import poses_at
+from msgs_slam.formats.datasets import VOID_LABEL, Camera, Dataset, open_sequence
+from msgs_slam.formats.datasets.folder import poses_at
+from msgs_slam.formats.datasets.nerfstudio import write_transforms
 from msgs_slam.formats.datasets.sequence import warp_nearest
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
@@ -269,9 +270,8 @@ def test_unknown_formats_and_places(tmp_path: Path) -> None:
         open_sequence(tmp_path / "none")
     with pytest.raises(InputError, match="none of the known"):
         open_sequence(tmp_path)
-    assert recognise(tmp_path) is None
     Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg")
-    assert recognise(tmp_path) == "folder"
+    assert open_sequence(tmp_path).format == "folder"
 
 
 def test_poses_at_takes_the_nearest_within_tolerance() -> None:
@@ -291,3 +291,17 @@ def test_warp_nearest_moves_a_ramp() -> None:
     # target rows 0..2 and 17..19 look above and below the source image
     assert (warped[[0, 1, 18, 19]] == 0).all()
     assert (warp_nearest(ramp, source, source) == ramp).all()
+
+
+def test_transforms_come_back_through_the_data_set_reader(tmp_path: Path) -> None:
+    poses = random_poses(3)
+    names = [f"frames/{i}.png" for i in range(3)]
+    for name in names:
+        write_rgb(tmp_path / name, np.zeros((6, 8, 3), np.uint8))
+    write_transforms(tmp_path / "transforms.json", Camera(8, 6, 7.0, 7.5, 4.25, 3.0), names, poses, "map.ply")
+    sequence = open_sequence(tmp_path)
+    assert sequence.format == "nerfstudio"
+    assert sequence.camera == Camera(8, 6, 7.0, 7.5, 4.25, 3.0)
+    np.testing.assert_allclose(sequence.world_from_cam, poses, atol=1e-12)
+    with pytest.raises(ValueError, match="got 2 images"):
+        write_transforms(tmp_path / "transforms.json", Camera(8, 6, 7.0, 7.5, 4.25, 3.0), names[:2], poses)

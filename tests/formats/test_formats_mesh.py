@@ -13,15 +13,8 @@ from PIL import Image
 
 from msgs_slam.formats import ply as ply_table
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.mesh import (
-    MeshBlocks,
-    TexturedMesh,
-    mesh_blocks,
-    read_mesh_ply,
-    write_mesh_glb,
-    write_mesh_ply,
-    write_textured_glb,
-)
+from msgs_slam.formats.glb import TexturedMesh, write_mesh_glb, write_textured_glb
+from msgs_slam.formats.ply import MeshBlocks, mesh_blocks, read_mesh_ply, write_mesh_ply
 
 
 @pytest.fixture

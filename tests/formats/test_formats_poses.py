@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.colmap import write_colmap_model
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.names import stem
+from msgs_slam.formats.image_folder import stem
 from msgs_slam.formats.poses import read_poses
 from msgs_slam.formats.trajectory import write_tum
 from tests.colmap_models import posed_images
@@ -117,7 +117,7 @@ def test_what_apps_on_phones_write_is_in_metres(
 @pytest.mark.parametrize(
     ("name", "text", "what"),
     [
-        ("keyframes/cameras/1.json", '{"t_00": 1}', "t_01"),
+        ("keyframes/cameras/1.json", '{"t_00": 1}', "no 4x4 matrix"),
         ("frame_00000.json", '{"cameraPoseARFrame": [1, 2]}', "sixteen numbers"),
         ("metadata.json", '{"poses": [[0, 0, 0, 1]]}', "seven numbers"),
         ("odometry.csv", "timestamp, frame, x\n0, 0, 1\n", "no column y"),
@@ -303,7 +303,7 @@ def test_poses_of_photogrammetry(write: Callable[[Path, Poses], Path], tmp_path:
     ("name", "text", "what"),
     [
         ("rc.csv", "#name,x,y,alt,heading,pitch,roll,f\n0.jpg,1,2,3,4,5,6,7\n", "as RealityScan and Metashape"),
-        ("cameras.sfm", "{}", "run its node ExportColmap"),
+        ("cameras.sfm", "{}", "its node ExportColmap"),
         ("cameras.xml", "<document><chunk/></document>", "no <camera> with a label"),
     ],
 )

@@ -19,7 +19,6 @@ from msgs_slam.formats.tensors import (
     load_arrays,
     load_tensors,
     save_arrays,
-    save_safetensors,
     save_tensors,
 )
 
@@ -35,7 +34,7 @@ ARRAYS = {
 
 
 def test_safetensors_round_trip(tmp_path: Path) -> None:
-    save_safetensors(tmp_path / "t.safetensors", ARRAYS)
+    save_tensors(tmp_path / "t.safetensors", ARRAYS)
     foreign = safetensors.numpy.load_file(str(tmp_path / "t.safetensors"))
     for name, array in ARRAYS.items():
         assert foreign[name].dtype == array.dtype
@@ -67,7 +66,7 @@ def test_bytes_do_not_depend_on_process_or_order(tmp_path: Path) -> None:
         "import sys; import numpy as np; from pathlib import Path; from msgs_slam.formats.tensors import *\n"
         "names = sys.argv[2].split(',')\n"
         "arrays = {n: np.arange(ord(n)) for n in names}\n"
-        "save_safetensors(Path(sys.argv[1] + '.safetensors'), arrays)\n"
+        "save_tensors(Path(sys.argv[1] + '.safetensors'), arrays)\n"
         "save_arrays(Path(sys.argv[1] + '.npz'), arrays)"
     )
     for name, order, seed in (("one", "a,b,c,d,e,f", "1"), ("two", "f,c,e,a,d,b", "2")):
@@ -99,7 +98,7 @@ def test_damaged_files_are_explained(tmp_path: Path, suffix: str) -> None:
     path, load = tmp_path / f"t{suffix}", load_arrays if suffix == ".npz" else load_tensors
     with pytest.raises(InputError, match="no such file"):
         load(path)
-    (save_arrays if suffix == ".npz" else save_safetensors)(path, ARRAYS)
+    (save_arrays if suffix == ".npz" else save_tensors)(path, ARRAYS)
     data = path.read_bytes()
     for keep in (0, 5, 100, len(data) // 2, len(data) - 1):
         path.write_bytes(data[:keep])

@@ -16,9 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.video import VideoReader, probe_video
-from msgs_slam.formats.video_clock import Clock, longest_step
-from msgs_slam.formats.video_writer import H264, MPEG4, VP9, best_codec, write_browser_video, write_video
+from msgs_slam.formats.video import Clock, VideoReader, probe_video
+from msgs_slam.formats.video_streams import H264, MPEG4, VP9, best_codec, write_browser_video, write_video
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -90,12 +89,8 @@ def test_frames_come_as_rgb_in_order_with_times(counted_video: Path) -> None:
     np.testing.assert_allclose(middle[:, 0], 6.0 * np.arange(40), atol=12)
     np.testing.assert_allclose(middle[:, 2], 240 - 6.0 * np.arange(40), atol=12)
     assert all(f.rgb[4, 4].min() > 200 and f.rgb[60, 90].min() < 60 for f in frames)
-
-
-def test_probe_agrees_with_what_is_decoded(counted_video: Path) -> None:
     info = probe_video(counted_video)
-    assert (info.width, info.height, info.frame_count_claimed) == (96, 64, 40)
-    assert info.fps == pytest.approx(25)
+    assert (info.width, info.height, info.frame_count_claimed, info.fps) == (96, 64, 40, pytest.approx(25))
 
 
 @pytest.mark.parametrize("wanted", [{3, 17, 39}, lambda i: i in (3, 17, 39), range(3, 40, 18)])
@@ -242,59 +237,31 @@ def test_a_damaged_file_is_silent_on_stderr(tmp_path: Path) -> None:
     assert (done.stdout, done.stderr) == ("refused\n", "")
 
 
-def _run_clock(stored: list[float], fps: float = 10.0) -> tuple[list[float], int]:
+def _run_clock(stored: list[float], fps: float = 10.0) -> Clock:
     clock = Clock(fps)
     for s in stored:
         clock.next(s)
-    return clock.times, clock.repairs
+    return clock
 
 
-def test_good_times_pass_unchanged() -> None:
-    assert _run_clock([5.0, 5.1, 5.35, 5.4]) == (pytest.approx([0, 0.1, 0.35, 0.4]), 0)
-
-
-def test_one_wrong_time_does_not_shift_the_rest() -> None:
-    times, repairs = _run_clock([0.0, 0.1, 0.2, 0.05, 0.4, 0.5])
-    assert times == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.5])
-    assert repairs == 1
-
-
-def test_a_clock_set_back_keeps_its_steps() -> None:
-    times, _ = _run_clock([0.0, 0.1, 0.2, 0.0, 0.05, 0.15])
-    assert times == pytest.approx([0, 0.1, 0.2, 0.3, 0.35, 0.45])
-
-
-def test_a_clock_set_back_is_one_restart_and_no_repair() -> None:
-    clock = Clock(10.0)
-    for stored in [0.0, 0.1, 0.2, 0.0, 0.1, 0.2, 0.3]:
-        clock.next(stored)
-    assert clock.times == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
-    assert (clock.repairs, clock.restarts) == (0, 1)
-
-
-@pytest.mark.parametrize(("head", "kept"), [(b"G" + bytes(187) + b"G", 8.0), (b"", 60.0)])
-def test_a_clock_that_jumps_goes_on_and_one_that_pauses_is_kept(head: bytes, kept: float) -> None:
-    far = 50 * longest_step(head)
-    clock = Clock(25.0, longest_step(head))
-    for stored in [0.0, 0.04, 0.08, 0.08 + kept, 0.12 + kept, far, far + 0.04, 0.2 + kept, 0.24 + kept]:
-        clock.next(stored)
-    steps = np.diff(clock.times)
-    assert steps == pytest.approx([0.04, 0.04, kept, 0.04, 0.04, 0.04, 0.04, 0.04], abs=1e-9)
-    assert (clock.repairs, clock.restarts) == (0, 2)
-
-
-def test_slow_clocks_do_not_jump() -> None:
-    hours = [3 * 3600.0 * i for i in range(6)]
-    assert _run_clock(hours, 1 / (3 * 3600))[0] == hours
-
-
-def test_missing_times_fall_back_to_the_rate() -> None:
-    assert _run_clock([0.0, 0.0, 0.0, 0.0])[0] == pytest.approx([0, 0.1, 0.2, 0.3])
+@pytest.mark.parametrize(
+    ("stored", "times", "repairs"),
+    [
+        pytest.param([5.0, 5.1, 5.35, 5.4], [0, 0.1, 0.35, 0.4], 0, id="good times"),
+        pytest.param([0.0, 0.1, 0.2, 0.05, 0.4, 0.5], [0, 0.1, 0.2, 0.3, 0.4, 0.5], 1, id="a wrong one"),
+        pytest.param([0.0, 0.1, 0.2, 0.0, 0.1, 0.2], [0, 0.1, 0.2, 0.3, 0.4, 0.5], 3, id="anew"),
+        pytest.param([0.0, 0.0, 0.0, 0.0], [0, 0.1, 0.2, 0.3], 3, id="none"),
+        pytest.param([0.0, 0.1, 60.0, 60.1], [0, 0.1, 60.0, 60.1], 0, id="a pause"),
+    ],
+)
+def test_times_are_kept_or_repaired(stored: list[float], times: list[float], repairs: int) -> None:
+    clock = _run_clock(stored)
+    assert (clock.times, clock.repairs) == (pytest.approx(times), repairs)
 
 
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True, min_value=None) | st.floats(0, 10), min_size=1))
 def test_times_always_increase(stored: list[float]) -> None:
-    times, _ = _run_clock([s if abs(s) < 1e6 or s != s else float("inf") for s in stored])
+    times = _run_clock([s if abs(s) < 1e6 or s != s else float("inf") for s in stored]).times
     assert times[0] == 0
     assert all(b > a for a, b in itertools.pairwise(times))
     assert np.isfinite(times).all()
@@ -320,11 +287,7 @@ X265 = "log-level=none:pools=1:frame-threads=1:bframes=0:keyint=8:open-gop=0"
 
 def write_hdr(path: Path, pictures: list[np.ndarray], transfer: str, aspect: Fraction | None = None) -> None:
     """10 bit HEVC that says its transfer function, pictures as uint16 RGB."""
-    options = {
-        "crf": "4",
-        "preset": "ultrafast",
-        "x265-params": X265,
-    }
+    options = {"crf": "4", "preset": "ultrafast", "x265-params": X265}
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx265", rate=10, options=options)
         stream.width, stream.height, stream.pix_fmt = pictures[0].shape[1], pictures[0].shape[0], "yuv420p10le"
@@ -424,7 +387,7 @@ def test_each_codec_shows_the_pictures(codec: str, name: str, tmp_path: Path) ->
 
 def test_the_best_codec_is_one_that_browsers_play(monkeypatch: pytest.MonkeyPatch) -> None:
     assert best_codec() == H264, "PyAV is there"
-    monkeypatch.setattr("msgs_slam.formats.video_writer._has_x264", lambda: False)
+    monkeypatch.setattr("msgs_slam.formats.video_streams._has_x264", lambda: False)
     assert best_codec() in (VP9, MPEG4)
 
 

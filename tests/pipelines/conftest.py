@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.mesh import MeshBlocks, write_mesh_ply
+from msgs_slam.formats.ply import MeshBlocks, write_mesh_ply
 from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.config import Config, MappingConfig
 from msgs_slam.pipelines.geometry.se3 import Similarity

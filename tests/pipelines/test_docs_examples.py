@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.formats.datasets import Dataset, opening
+from msgs_slam.formats import datasets
+from msgs_slam.formats.datasets import Dataset
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import Config
@@ -76,16 +77,16 @@ def test_data_set(monkeypatch: pytest.MonkeyPatch, truth: Dataset, tmp_path: Pat
         place = ",".join(str(v) for v in truth.world_from_cam[i, :3, 3])
         lines.append(f"{i}.png,{truth.timestamps[i]},{place},{w},{x},{y},{z}")
     (tmp_path / "poses.csv").write_text("\n".join(lines))
-    reader = opening._Reader(pose_table.recognises, pose_table.open_pose_table)
-    monkeypatch.setattr(opening, "_READERS", {"pose-table": reader, **opening._READERS})
-    sequence = opening.open_sequence(tmp_path)
+    reader = datasets._Reader(pose_table.recognises, pose_table.open_pose_table)
+    monkeypatch.setattr(datasets, "_READERS", {"pose-table": reader, **datasets._READERS})
+    sequence = datasets.open_sequence(tmp_path)
     assert (sequence.format, len(sequence)) == ("pose-table", 3)
     assert sequence.world_from_cam is not None
     np.testing.assert_allclose(sequence.world_from_cam, truth.world_from_cam[:3], atol=1e-9)
     np.testing.assert_array_equal(sequence.rgb(2), truth.rgb(2))
     (tmp_path / "poses.csv").write_text("\n".join([lines[0], "file,seconds", "0.png,1"]))
     with pytest.raises(InputError, match="pose table"):
-        opening.open_sequence(tmp_path)
+        datasets.open_sequence(tmp_path)
 
 
 def test_export(oracle_run: OracleRun, tmp_path: Path) -> None:

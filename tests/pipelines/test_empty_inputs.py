@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from msgs_slam.formats.mesh import MeshArrays
+from msgs_slam.formats.ply import MeshArrays
 from msgs_slam.pipelines.depth.align import (
     COARSE,
     Anchors,

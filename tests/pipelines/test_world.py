@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.video import VideoReader
-from msgs_slam.formats.video_writer import write_video
+from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.types import Intrinsics
 from tests.world import (
     ClipOptions,

@@ -4,7 +4,7 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-from msgs_slam.formats.video_writer import write_video
+from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.evaluation.write import CLIP, TRUTH, VIDEO
 from tests.world import ClipOptions, iter_clip, make_world, write_sequence
 

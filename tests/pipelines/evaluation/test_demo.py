@@ -12,7 +12,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.image_folder import list_images
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.formats.video import VideoReader
-from msgs_slam.formats.video_writer import write_video
+from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.evaluation.metrics import psnr
 from msgs_slam.pipelines.evaluation.write import TRUTH, VIDEO, demo_summary, run_demo, unpack_demo_clip
 from msgs_slam.pipelines.run.folder import RunFolder

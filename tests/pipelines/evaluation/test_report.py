@@ -15,8 +15,8 @@ from finished import note_finished
 
 from msgs_slam.formats.datasets import Dataset
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.glb import TexturedMesh, write_textured_glb
 from msgs_slam.formats.images import decode_rgb
-from msgs_slam.formats.mesh import TexturedMesh, write_textured_glb
 from msgs_slam.pipelines.evaluation.facts import Capture, advice, found_lengths, lost_stretches
 from msgs_slam.pipelines.evaluation.html import Line, page, plot, section, table, ticks
 from msgs_slam.pipelines.evaluation.report import truth_section, write_report

@@ -11,7 +11,7 @@ import trimesh
 from ball import CAMERA, RADIUS, orbit, pixel_rays, see_ball, seen_points
 from numpy.typing import NDArray
 
-from msgs_slam.formats.mesh import read_mesh_ply, write_mesh_ply
+from msgs_slam.formats.ply import read_mesh_ply, write_mesh_ply
 from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.export.mesh import paint
 from msgs_slam.pipelines.export.surface import Region, Surface, Triangles, chunk_surfaces, closed, joined, weld

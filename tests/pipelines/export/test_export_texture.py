@@ -8,7 +8,7 @@ import trimesh
 from ball import CAMERA, RADIUS, see_ball, seen_points
 from numpy.typing import NDArray
 
-from msgs_slam.formats.mesh import MeshArrays
+from msgs_slam.formats.ply import MeshArrays
 from msgs_slam.pipelines.compute.raster import draw_faces
 from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.export import texture

@@ -13,7 +13,7 @@ import torch
 
 from msgs_slam.formats import atomic
 from msgs_slam.formats.errors import DiskFullError
-from msgs_slam.formats.gaussians import GaussianCloud
+from msgs_slam.formats.splats import GaussianCloud
 from msgs_slam.pipelines.config import Config, ExportConfig
 from msgs_slam.pipelines.export import splats
 from msgs_slam.pipelines.export.scene import ExportScene

@@ -10,8 +10,9 @@ import pytest
 from finished import note_finished
 
 from msgs_slam.formats.errors import InputError
+from msgs_slam.formats.glb import TexturedMesh, write_textured_glb
 from msgs_slam.formats.images import decode_rgb
-from msgs_slam.formats.mesh import TexturedMesh, read_mesh_ply, write_textured_glb
+from msgs_slam.formats.ply import read_mesh_ply
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.stage import export_run, find_world
 from msgs_slam.pipelines.outcome import load_outcome

@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.mesh import read_mesh_ply
+from msgs_slam.formats.ply import read_mesh_ply
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.evaluation.report import write_report
 from msgs_slam.pipelines.evaluation.serve import PageServer

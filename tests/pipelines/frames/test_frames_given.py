@@ -13,7 +13,7 @@ from msgs_slam.formats.colmap import write_colmap_model
 from msgs_slam.formats.datasets.sequence import Camera
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.video_writer import write_video
+from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.frames.findings import _require_same_images
 from msgs_slam.pipelines.geometry import se3

@@ -11,12 +11,11 @@ from hypothesis import strategies as st
 
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.formats.video import VideoFrame
-from msgs_slam.formats.video_writer import write_video
+from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.frames.keyframes import pick_frames
 from msgs_slam.pipelines.run.stages import StageContext
-from msgs_slam.pipelines.source.overlap import Motion
+from msgs_slam.pipelines.source.picking import Motion, reduce_image, reduced_size, sharpest_of_windows, sharpness
 from msgs_slam.pipelines.source.recording import open_recording
-from msgs_slam.pipelines.source.sharpness import reduce_image, reduced_size, sharpest_of_windows, sharpness
 
 BLANK = np.zeros((2, 2, 3), np.uint8)
 

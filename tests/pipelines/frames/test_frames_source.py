@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 from msgs_slam.formats import reading
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb, write_grey_png, write_rgb
-from msgs_slam.formats.video_writer import write_video
+from msgs_slam.formats.video_streams import write_video
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.frames.stage import places_figure, run
 from msgs_slam.pipelines.reconstruct import one_source

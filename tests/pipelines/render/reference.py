@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from msgs_slam.formats.quiet import ignored_warnings
+from msgs_slam.formats.errors import ignored_warnings
 from msgs_slam.pipelines.paper.rendering import Pairs, ends_of, pair_opacities, pixel_pairs, transmittance_before
 from msgs_slam.pipelines.render.rules import TRANSMITTANCE_MIN, GaussianStats
 

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from msgs_slam.formats.names import match_names
-from msgs_slam.formats.reading import named_file
+from msgs_slam.formats.image_folder import match_names, named_file
 
 
 @pytest.mark.parametrize(
