@@ -55,7 +55,7 @@ def batch(
     \b
     Example: msgs-slam batch videos --out runs --quality draft
     """
-    from ..pipelines.batch import find_recordings, run_batch, table_row, write_table
+    from ..pipelines.reconstruct import find_recordings, run_batch, table_row, write_table
 
     recordings = find_recordings(folder.resolve(), out.resolve())
     read = partial(chosen_config, config_file, overrides, given)
@@ -63,7 +63,7 @@ def batch(
         out.mkdir(parents=True, exist_ok=True)
         try:
             with output.stopping_softly("The same command goes on with it."):
-                failed = run_batch(recordings[shard], read, until, output, cluster)
+                failed = run_batch(recordings[shard], read, until, output.task_progress, cluster)
         finally:
             write_table(out, rows := [table_row(r) for r in recordings])
     if not output.quiet:

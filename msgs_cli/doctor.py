@@ -10,20 +10,31 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import click
 
 from ..formats.errors import install_command
-from ..pipelines.system.wording import BAD, GOOD, NOTE, Finding
 from .output import say
 
 DISTRIBUTION = "msgs-slam"
+GOOD, NOTE, BAD = "ok", "note", "BAD"
 _MODULES = (
     "torch", "cv2", "pycolmap", "numba", "onnxruntime", "scipy", "skimage", "PIL", "trimesh", "safetensors"
 )  # fmt: skip
 _MIN_MEMORY, _MIN_DISK = 4.0, 3.0
 """Gigabytes: the largest run of the benchmarks peaks at 1.8 and fills 0.5."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Result of a check; `fix` says what to type or change, "" where nothing needs to be."""
+
+    state: str
+    text: str
+    fix: str = ""
+    name: str = ""
 
 
 @click.command()
@@ -49,29 +60,27 @@ def print_findings(findings: Sequence[Finding]) -> None:
 
 def examine(folder: Path) -> list[Finding]:
     """Every check in order; `folder` is where runs would be written. Never raises: what fails is a finding."""
-    checks: tuple[tuple[str, Callable[[], Finding]], ...] = (
-        ("program", _program), ("requirements", _requirements), ("libraries", _libraries), ("video", _video),
-        ("threads", _threads), ("memory", _memory), ("gpu", _gpu), ("models", _models),
-        ("compiled kernels", _kernels), ("disk", lambda: _disk(folder)),
-    )  # fmt: skip
-    return [_guarded(name, check) for name, check in checks]
+    checks: dict[str, Callable[[], Finding]] = {
+        "program": _program, "requirements": _requirements, "libraries": _libraries, "video": _video,
+        "threads": _threads, "memory": _memory, "gpu": _gpu, "models": _models, "compiled kernels": _kernels,
+        "disk": lambda: _disk(folder),
+    }  # fmt: skip
+    return [replace(_guarded(check), name=name) for name, check in checks.items()]
 
 
-def _guarded(name: str, check: Callable[[], Finding]) -> Finding:
+def _guarded(check: Callable[[], Finding]) -> Finding:
     try:
         return check()
     except Exception as error:  # the whole point is to go on and say it
-        return Finding(name, BAD, f"the check itself failed: {type(error).__name__}: {error}")
+        return Finding(BAD, f"the check itself failed: {type(error).__name__}: {error}")
 
 
 def _program() -> Finding:
     python = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
     try:
-        return Finding("program", GOOD, f"{DISTRIBUTION} {importlib.metadata.version(DISTRIBUTION)}, {python}")
+        return Finding(GOOD, f"{DISTRIBUTION} {importlib.metadata.version(DISTRIBUTION)}, {python}")
     except importlib.metadata.PackageNotFoundError:
-        return Finding(
-            "program", NOTE, f"run from its sources, {python}", f"{install_command('.')} in the folder of the sources"
-        )
+        return Finding(NOTE, f"run from its sources, {python}", f"{install_command('.')} in the folder of the sources")
 
 
 def _requirements() -> Finding:
@@ -81,21 +90,18 @@ def _requirements() -> Finding:
     try:
         wanted = [Requirement(text) for text in importlib.metadata.requires(DISTRIBUTION) or ()]
     except importlib.metadata.PackageNotFoundError:
-        return Finding("requirements", NOTE, "unknown: the program is not installed", install_command("."))
-    wrong, lacking = [], []
-    for r in wanted:
-        if r.marker is not None and not r.marker.evaluate({"extra": ""}):
-            continue
+        return Finding(NOTE, "unknown: the program is not installed", install_command("."))
+    wrong = {}
+    for r in (r for r in wanted if r.marker is None or r.marker.evaluate({"extra": ""})):
         try:
             version = importlib.metadata.version(r.name)
+            if not r.specifier.contains(version, prereleases=True):
+                wrong[f"{r.name}{r.specifier}"] = f"{r.name} is {version}, wanted {r.specifier}"
         except importlib.metadata.PackageNotFoundError:
-            version = ""
-        if not version or not r.specifier.contains(version, prereleases=True):
-            wrong.append(f"{r.name} is {version}, wanted {r.specifier}" if version else f"{r.name} is missing")
-            lacking.append(f"{r.name}{r.specifier}")
+            wrong[f"{r.name}{r.specifier}"] = f"{r.name} is missing"
     if wrong:
-        return Finding("requirements", BAD, "; ".join(wrong), install_command(*lacking))
-    return Finding("requirements", GOOD, "all packages present, versions compatible")
+        return Finding(BAD, "; ".join(wrong.values()), install_command(*wrong))
+    return Finding(GOOD, "all packages present, versions compatible")
 
 
 def _libraries() -> Finding:
@@ -105,14 +111,12 @@ def _libraries() -> Finding:
         try:
             importlib.import_module(name)
         except Exception as error:  # a broken wheel raises anything
-            broken.append(f"{name} ({str(error).splitlines()[0] if str(error) else type(error).__name__})")
+            broken.append(f"{name} ({(str(error).splitlines() or [type(error).__name__])[0]})")
     if broken:
-        return Finding(
-            "libraries", BAD, "do not load: " + ", ".join(broken), install_command("--force-reinstall", "PACKAGE")
-        )
+        return Finding(BAD, "do not load: " + ", ".join(broken), install_command("--force-reinstall", "PACKAGE"))
     import torch
 
-    return Finding("libraries", GOOD, f"all libraries load; torch {torch.__version__}")
+    return Finding(GOOD, f"all libraries load; torch {torch.__version__}")
 
 
 def _video() -> Finding:
@@ -128,21 +132,18 @@ def _video() -> Finding:
         read = sum(1 for _ in VideoReader(path))
     if read != len(frames):
         fix = install_command("--force-reinstall", "opencv-python-headless")
-        return Finding("video", BAD, f"{read} of {len(frames)} frames came back from an MP4", fix)
-    return Finding("video", GOOD, "MP4 read and write work")
+        return Finding(BAD, f"{read} of {len(frames)} frames came back from an MP4", fix)
+    return Finding(GOOD, "MP4 read and write work")
 
 
 def _threads() -> Finding:
     from ..pipelines.system.machine import available_cpus
 
-    cores = available_cpus()
-    limit = os.environ.get("OMP_NUM_THREADS", "")
+    cores, limit = available_cpus(), os.environ.get("OMP_NUM_THREADS", "")
     if limit.isdecimal() and 0 < int(limit) < cores:
-        return Finding(
-            "threads", NOTE, f"{cores} cores, but OMP_NUM_THREADS={limit} holds some libraries back",
-            "unset OMP_NUM_THREADS; --set run.threads=N says how many the program takes",
-        )  # fmt: skip
-    return Finding("threads", GOOD, f"{cores} cores to use")
+        fix = "unset OMP_NUM_THREADS; --set run.threads=N says how many the program takes"
+        return Finding(NOTE, f"{cores} cores, but OMP_NUM_THREADS={limit} holds some libraries back", fix)
+    return Finding(GOOD, f"{cores} cores to use")
 
 
 def _memory() -> Finding:
@@ -151,8 +152,8 @@ def _memory() -> Finding:
     size = machine_memory() / 1e9
     if size < _MIN_MEMORY:
         fix = "--set frames.max_side=480 needs less, or take a machine with more"
-        return Finding("memory", NOTE, f"{size:.1f} GB; under {_MIN_MEMORY:g} long videos may not fit", fix)
-    return Finding("memory", GOOD, f"{size:.1f} GB")
+        return Finding(NOTE, f"{size:.1f} GB; under {_MIN_MEMORY:g} long videos may not fit", fix)
+    return Finding(GOOD, f"{size:.1f} GB")
 
 
 def _gpu() -> Finding:
@@ -161,24 +162,21 @@ def _gpu() -> Finding:
     from ..pipelines.system.machine import unused_card
 
     if unused := unused_card():
-        return Finding("gpu", NOTE, *unused)
-    if torch.cuda.is_available():
-        properties = torch.cuda.get_device_properties(0)
-        return Finding(
-            "gpu", GOOD, f"{properties.name}, {properties.total_memory / 1e9:.0f} GB; --device auto takes it"
-        )
-    return Finding("gpu", GOOD, "none; everything runs on the CPU")
+        return Finding(NOTE, *unused)
+    if not torch.cuda.is_available():
+        return Finding(GOOD, "none; everything runs on the CPU")
+    card = torch.cuda.get_device_properties(0)
+    return Finding(GOOD, f"{card.name}, {card.total_memory / 1e9:.0f} GB; --device auto takes it")
 
 
 def _models() -> Finding:
     from ..pipelines.networks.registry import ModelStore
 
     store = ModelStore.open()
-    here = [model.name for model in store.models if store.is_here(model)]
-    if here:
-        return Finding("models", GOOD, f"{', '.join(here)} in {store.cache}")
+    if here := [model.name for model in store.models if store.is_here(model)]:
+        return Finding(GOOD, f"{', '.join(here)} in {store.cache}")
     text = f"none in {store.cache}: without networks metres are less certain and few classes have names"
-    return Finding("models", NOTE, text, "msgs-slam models pull")
+    return Finding(NOTE, text, "msgs-slam models pull")
 
 
 def _kernels() -> Finding:
@@ -189,16 +187,16 @@ def _kernels() -> Finding:
         folder = cache_root()
     if folder is None:
         fix = "set NUMBA_CACHE_DIR to a folder of yours that can be written"
-        return Finding("compiled kernels", NOTE, "cannot be kept: every start compiles for about a minute", fix)
+        return Finding(NOTE, "cannot be kept: every start compiles for about a minute", fix)
     kept = sum(1 for _ in folder.rglob("*.nbi"))
-    return Finding("compiled kernels", GOOD, f"{kept} kept in {folder}" if kept else f"will be kept in {folder}")
+    return Finding(GOOD, f"{kept} kept in {folder}" if kept else f"will be kept in {folder}")
 
 
 def _disk(folder: Path) -> Finding:
-    free = shutil.disk_usage(folder).free / 1e9
+    free, place = shutil.disk_usage(folder).free / 1e9, folder.resolve()
     if not os.access(folder, os.W_OK):
-        return Finding("disk", BAD, f"{folder.resolve()} cannot be written", "work in another folder, or give --out")
+        return Finding(BAD, f"{place} cannot be written", "work in another folder, or give --out")
     if free < _MIN_DISK:
         fix = "make room, or write to another disk with --out"
-        return Finding("disk", BAD, f"{free:.1f} GB free in {folder.resolve()}; a run takes up to {_MIN_DISK:g}", fix)
-    return Finding("disk", GOOD, f"{free:.0f} GB free in {folder.resolve()}")
+        return Finding(BAD, f"{free:.1f} GB free in {place}; a run takes up to {_MIN_DISK:g}", fix)
+    return Finding(GOOD, f"{free:.0f} GB free in {place}")

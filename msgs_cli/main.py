@@ -20,7 +20,6 @@ from ..pipelines.system.wording import quoted
 from . import results
 from .batch import batch
 from .doctor import doctor
-from .json_lines import Interrupted, is_asked_for, json_outcome
 from .models import models
 from .options import (
     FOLDER,
@@ -39,14 +38,15 @@ from .options import (
     use_threads,
 )
 from .output import (
+    Interrupted,
     Output,
     flush_output,
+    is_asked_for,
+    json_outcome,
     on_sigterm,
     prepare_streams,
-    print_summary,
     printable,
     program,
-    report_run,
     say,
     verbosity_options,
 )
@@ -158,16 +158,9 @@ def main() -> None:
 @engine_options("local: all in this process; ray: keyframes' depths and submaps on the nodes of a cluster.")
 @verbosity_options
 def reconstruct_command(
-    sources: tuple[Path, ...],
-    out: Path | None,
-    config_file: Path | None,
-    overrides: tuple[str, ...],
-    until: str,
-    engine_name: str,
-    address: str,
-    output: Output,
-    **given: str | int | None,
-) -> None:
+    sources: tuple[Path, ...], out: Path | None, config_file: Path | None, overrides: tuple[str, ...], until: str,
+    engine_name: str, address: str, output: Output, **given: str | int | None,
+) -> None:  # fmt: skip
     """Reconstruct SOURCE, a video, a folder of images or a data set, into a run folder; several videos of one place
     from one camera become one run.
 
@@ -187,7 +180,7 @@ def reconstruct_command(
         output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"),
     ):
         records = reconstruct(one_source(sources, run), run, config, output.progress(), until, workers)
-    report_run(output, run.root, records)
+    results.report_run(output, run.root, records)
 
 
 @main.command("resume")
@@ -203,16 +196,9 @@ def reconstruct_command(
 @engine_options("local: all in this process; ray: keyframes' depths and submaps on the nodes of a cluster.")
 @verbosity_options
 def resume_command(
-    run_path: Path,
-    redo: str | None,
-    config_file: Path | None,
-    overrides: tuple[str, ...],
-    until: str,
-    engine_name: str,
-    address: str,
-    output: Output,
-    **given: str | int | None,
-) -> None:
+    run_path: Path, redo: str | None, config_file: Path | None, overrides: tuple[str, ...], until: str,
+    engine_name: str, address: str, output: Output, **given: str | int | None,
+) -> None:  # fmt: skip
     """Resume RUN where it stopped. Finished stages are kept unless one of their settings is changed, or --redo names
     them. A stage that is run again replaces its old output only if it succeeds.
 
@@ -221,18 +207,17 @@ def resume_command(
     """
     if redo and STAGES.index(redo) > STAGES.index(until):
         raise click.UsageError(f"--redo {redo} comes after --until {until}: nothing would be made again")
-    from ..pipelines.reconstruct import require_run, resume
-    from ..pipelines.run.folder import RunFolder, load_settings
+    from ..pipelines.reconstruct import resume
+    from ..pipelines.run.folder import RunFolder
 
-    run = RunFolder(run_path)
-    require_run(run)
-    config = chosen_config(config_file, overrides, given, load_settings(run))
+    run = RunFolder(run_path).required()
+    config = chosen_config(config_file, overrides, given, run.settings())
     with (
         open_cluster(engine_name, address, config, output) as workers,
         output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"),
     ):
         records = resume(run, output.progress(), config, until, workers, redo=redo or "")
-    report_run(output, run.root, records)
+    results.report_run(output, run.root, records)
 
 
 @main.command("extend")
@@ -255,7 +240,7 @@ def extend_command(run_path: Path, videos: tuple[Path, ...], output: Output) -> 
     run = RunFolder(run_path)
     with output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"):
         records = extend(run, videos, output.progress())
-    report_run(output, run.root, records)
+    results.report_run(output, run.root, records)
 
 
 _EXPORT_HELP = f"""Export a finished RUN to files for other programs. What the run writes by itself is in RUN/export and
@@ -283,22 +268,17 @@ Example: msgs-slam export video.msgs --only ply --to shared
 @settings_options
 @verbosity_options
 def export(
-    run_path: Path,
-    only: str | None,
-    to: Path | None,
-    overwrite: bool,
-    config_file: Path | None,
-    overrides: tuple[str, ...],
-    output: Output,
-) -> None:
+    run_path: Path, only: str | None, to: Path | None, overwrite: bool, config_file: Path | None,
+    overrides: tuple[str, ...], output: Output,
+) -> None:  # fmt: skip
     """Write exports, as the help above says."""
     if others := [text for text in overrides if not text.startswith("export.")]:
         raise click.UsageError(
             f"--set {others[0]}: an export has the settings of [export] alone; of the rest of the run: "
             f"msgs-slam resume {quoted(run_path)} --set {quoted(others[0])}"
         )
-    from ..pipelines.read_config import load_config, with_absolute_paths
     from ..pipelines.reconstruct import made_with
+    from ..pipelines.run.settings import load_config, with_absolute_paths
 
     run = open_run(run_path)
     from ..pipelines.export.stage import export_folder, export_run
@@ -316,14 +296,9 @@ def export(
 
 @main.command()
 @click.option(
-    "--out",
-    "-o",
-    type=FOLDER,
-    default=Path("msgs-demo"),
-    metavar="DIR",
-    show_default=True,
+    "--out", "-o", type=FOLDER, default=Path("msgs-demo"), metavar="DIR", show_default=True,
     help="Where the clip, its ground truth and the run are written.",
-)
+)  # fmt: skip
 @settings_options
 @device_option
 @verbosity_options
@@ -340,7 +315,7 @@ def demo(
         with output.stopping_softly(f"Resume with: msgs-slam resume {quoted(run.root)}"):
             records = reconstruct(video, run, config, output.progress())
         if not output.quiet:
-            print_summary(run.root, records)
+            results.print_summary(run.root, records)
 
     result = run_demo(out, reconstruct_clip, output.progress())
     root = result.run.root
@@ -368,7 +343,7 @@ def completion(shell: str) -> None:
 @settings_options
 def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
     """Print every setting as commented TOML: save it, change it, pass it with --config."""
-    from ..pipelines.read_config import config_to_toml, load_config
+    from ..pipelines.run.settings import config_to_toml, load_config
 
     click.echo(config_to_toml(load_config(config_file, overrides)), nl=False)
 

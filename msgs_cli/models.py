@@ -54,16 +54,13 @@ def list_models() -> None:
 @click.argument("names", nargs=-1)
 @click.option("--best", is_flag=True, help="The small ones and the large network for metric depth (80 MB in all).")
 @click.option(
-    "--from",
-    "folder",
-    type=click.Path(path_type=Path),
+    "--from", "folder", type=click.Path(path_type=Path),
     help="Take the files from this folder, under any file names, instead of the network.",
-)
+)  # fmt: skip
 @click.option(
-    "--trust",
-    is_flag=True,
+    "--trust", is_flag=True,
     help="Accept a model without a published sha256 (DINOv2's head), and remember the hash of the downloaded file.",
-)
+)  # fmt: skip
 @click.option("--offline", is_flag=True, help="Only check what is here; download nothing.")
 @click.option("--yes", is_flag=True, help="Do not ask about the licences.")
 def pull(names: tuple[str, ...], best: bool, folder: Path | None, trust: bool, offline: bool, yes: bool) -> None:

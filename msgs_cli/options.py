@@ -88,9 +88,11 @@ def setting_option(key: str) -> Callable[[Callable[..., None]], Callable[..., No
     """Return a decorator that adds the option of a setting, as the table of settings describes it."""
     known = settings_with_options()[key]
     option: Option = known.metadata["option"]
+    text = known.metadata["help"]
+    default = f". Default: {known.default}." if known.default != "" else "."
     return click.option(
         f"--{option.name}", key.replace(".", "__"), type=int if isinstance(known.default, int) else str,
-        metavar=option.metavar or "|".join(known.metadata["choices"]), help=option.help or known.metadata["help"],
+        metavar=option.metavar or "|".join(known.metadata["choices"]), help=text[0].upper() + text[1:] + default,
     )  # fmt: skip
 
 
@@ -118,7 +120,7 @@ def chosen_config(
         given: of the options of settings, by `section__key`; None where one is not given.
         base: what holds where nothing is given; None for the defaults.
     """
-    from ..pipelines.read_config import load_config, merge_settings
+    from ..pipelines.run.settings import load_config, merge_settings
 
     quality = given.get("run__quality")
     config = load_config(file, overrides, base, None if quality is None else str(quality))
@@ -132,18 +134,14 @@ def chosen_config(
 def use_threads(run: RunFolder | None = None) -> None:
     """Let the libraries of this process use as many CPU threads as the run's settings say, or all that there are: a
     container's share, not its machine's."""
-    from ..pipelines.run.folder import load_settings
-    from ..pipelines.run.tasks import limit_threads
     from ..pipelines.system.machine import available_cpus
+    from ..pipelines.system.threads import limit_threads
 
-    limit_threads((load_settings(run).run.threads if run is not None else 0) or available_cpus())
+    limit_threads((run.settings().run.threads if run is not None else 0) or available_cpus())
 
 
 def open_run(path: Path) -> RunFolder:
     """Raises InputError for a folder that is no run."""
-    from ..pipelines.reconstruct import require_run
     from ..pipelines.run.folder import RunFolder
 
-    run = RunFolder(path)
-    require_run(run)
-    return run
+    return RunFolder(path).required()

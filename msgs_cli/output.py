@@ -1,7 +1,13 @@
-"""Output of a command: logs, progress, tables, its result and how it ends, as text or as JSON lines."""
+"""Output of a command: logs, progress, tables, its result and how it ends, as text or as JSON lines.
+
+`--log-format json`: events of a run as one JSON object a line on stderr, for programs that watch; libraries may print
+text there too. Each has `event` and `time` (seconds since 1970): stage, progress, warning, log, stopping, and one of
+result, stopped, error at the end.
+"""
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import shlex
@@ -9,10 +15,13 @@ import shutil
 import signal
 import sys
 import textwrap
+import time
+import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -31,24 +40,9 @@ from ..pipelines.system.progress import (
     log,
     soft_stop,
 )  # fmt: skip
-from ..pipelines.system.wording import figure_text
-from .json_lines import JsonHandler, JsonProgress, write_line
 
 if TYPE_CHECKING:
     from tqdm import tqdm
-
-    from ..pipelines.run.manifest import StageRecord
-    from ..pipelines.run.status import StageStatus
-
-KEY_FIGURES = {
-    "frames": ("frames", "keyframes_placed", "calibration", "focal_px", "focal_sd_px", "still_left_out", "gps"),
-    "proxy": ("depth", "semantics", "metric", "metres_per_unit", "classes"),
-    "tracking": ("posed", "keyframes", "lost", "scale"),
-    "mapping": ("gaussians", "keyframe_psnr"),
-    "global_ba": ("loops", "images_posed", "keyframe_psnr"),
-    "export": ("images", "vertices", "faces", "up", "floor", "gps"),
-}
-"""What a person wants to know first; `status -v` says all."""
 
 T = TypeVar("T")
 _BAR = "{desc} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
@@ -59,6 +53,9 @@ _STOPPING = (
 )
 _shown: set[str] = set()
 """The warnings shown since logging was set up."""
+_SECONDS_BETWEEN = 0.2
+_stage: dict[str, Any] = {}
+"""The stage that runs."""
 
 
 def verbosity_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -289,52 +286,88 @@ def terminal_width() -> int:
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
 
 
-def status_table(stages: Sequence[StageStatus], everything: bool = False) -> str:
-    """One row a stage: state, seconds, peak memory, key figures or all of them."""
-    rows = []
-    for stage in stages:
-        if (record := stage.record) is None:
-            rows.append([stage.name, stage.state_text, "", "", ""])
-            continue
-        wanted = record.figures if everything else [k for k in KEY_FIGURES[stage.name] if k in record.figures]
-        figures = ", ".join(f"{key} {figure_text(record.figures[key], key)}" for key in wanted)
-        rows.append([stage.name, stage.state, f"{record.seconds:.1f}", f"{record.peak_memory_mb:.0f}", figures])
-    return format_table(["stage", "state", "seconds", "peak MB", "figures"], rows, terminal_width())
+class Interrupted(click.ClickException):
+    """A command that keeps nothing of what it was at was stopped."""
+
+    exit_code = 128 + signal.SIGINT
 
 
-def scale_lines(root: Path, records: dict[str, StageRecord]) -> list[str]:
-    """Return the line about the scale of the world; none before the export has estimated it."""
-    from ..pipelines.run.files import METRES
-    from ..pipelines.run.folder import RunFolder
-
-    metres = RunFolder(root).find(METRES) if "export" in records else None
-    return [] if metres is None else [f"\nScale: {metres.text}"]
+def write_line(event: str, **values: Any) -> None:
+    """{"event": ..., "time": seconds since 1970, ...}, in one piece whatever else is written."""
+    sys.stderr.write(json.dumps({"event": event, "time": round(time.time(), 3), **values}) + "\n")
+    sys.stderr.flush()
 
 
-def warning_lines(records: dict[str, StageRecord], was_shown: Callable[[str], bool] = lambda text: False) -> list[str]:
-    """Every degraded result, by stage, that is not said yet."""
-    return [
-        f"warning ({n}): {text}" for n, record in records.items() for text in record.warnings if not was_shown(text)
-    ]
+class JsonProgress:
+    """{"event": "stage", "name", "index", "of", "state", ...} and {"event": "progress", "label", "done", "total"}, of
+    these at most five a second and one at each end; with {"job"} where it is one of several."""
+
+    def __init__(self, job: str = "") -> None:
+        self._job = {"job": job} if job else {}
+
+    def track(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+        """Yield the items, and write a progress line every so often."""
+        done, said = 0, 0.0
+        self._report(label, 0, total)
+        for done, item in enumerate(items, 1):
+            yield item
+            if time.monotonic() - said > _SECONDS_BETWEEN:
+                said = time.monotonic()
+                self._report(label, done, total)
+        self._report(label, done, total, ended=True)
+
+    def _report(self, label: str, done: int, total: int | None, **more: Any) -> None:
+        write_line("progress", **self._job, **_stage, label=label, done=done, total=total, **more)
+
+    def stage(self, event: StageEvent) -> None:
+        """Write a line for the start or the end of a stage."""
+        _stage.clear()
+        if event.state == BEGUN:
+            _stage.update(stage=event.name, index=event.index, of=event.of)
+        left = event.left()
+        values: dict[str, Any] = {"name": event.name, "index": event.index, "of": event.of, "state": event.state}
+        if event.seconds:
+            values |= {"seconds": round(event.seconds, 2), "figures": event.figures}
+        write_line("stage", **self._job, **values, seconds_left=None if left is None else round(left))
 
 
-def report_run(output: Output, root: Path, records: dict[str, Any]) -> None:
-    """Say how the run is now, for people unless they want errors only, and for programs."""
-    if not output.quiet:
-        print_summary(root, records)
-    output.report_result(run=root, **({"export": root / "export"} if "export" in records else {}))
+class JsonHandler(logging.Handler):
+    """{"event": "warning", "message"}, or {"event": "log", "level", "message"}."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record of the log as one line."""
+        if record.levelno == logging.WARNING:
+            write_line("warning", **_stage, message=record.getMessage())
+        else:
+            write_line("log", level=record.levelname.lower(), message=record.getMessage())
 
 
-def print_summary(root: Path, records: dict[str, Any]) -> None:
-    """Print the table, what is not said yet, and where the results are."""
-    from ..pipelines.run.status import DONE, StageStatus
+def is_asked_for(arguments: Iterable[str]) -> bool:
+    """Whether a command line asks for JSON lines; seen before it is parsed, for errors in it are reported so."""
+    words = list(arguments)
+    given = [b for a, b in pairwise(words) if a == "--log-format"]
+    given += [w.partition("=")[2] for w in words if w.startswith("--log-format=")]
+    return given[-1:] == ["json"]
 
-    say(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
-    for line in warning_lines(records, was_shown):
-        say(line, err=True)
-    for line in scale_lines(root, records):
-        say(line)
-    if "export" in records:
-        say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
-        if (page := root / "export" / "map.html").exists():
-            say(f"Open in a browser: {page}")
+
+@contextmanager
+def json_outcome() -> Iterator[None]:
+    """Report how the command in this block ends as a JSON line. Always ends with SystemExit."""
+    code = 0
+    try:
+        yield
+    except click.exceptions.Exit as ended:
+        code = ended.exit_code
+    except SystemExit as ended:
+        code = ended.code if isinstance(ended.code, int) else int(bool(ended.code))
+    except (click.Abort, KeyboardInterrupt, Interrupted) as error:
+        code = Interrupted.exit_code
+        write_line("stopped", signal=int(signal.SIGINT), message=str(error), exit_code=code)
+    except click.ClickException as error:
+        code = error.exit_code
+        write_line("error", message=error.format_message(), exit_code=code)
+    except Exception as error:
+        code = 1
+        trace = "".join(traceback.format_exception(error))
+        write_line("error", message=f"{type(error).__name__}: {error}", exit_code=code, traceback=trace)
+    sys.exit(code)

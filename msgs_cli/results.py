@@ -1,15 +1,33 @@
 """Commands on the results of a run: status, evaluate, report, render, view."""
 
+from __future__ import annotations
+
 import json
 import re
 import signal
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..pipelines.system.wording import figure_text
 from .options import OVERWRITE, RUN_ARGUMENT, open_run, use_threads
-from .output import Output, on_sigterm, say, verbosity_options
+from .output import Output, format_table, on_sigterm, say, terminal_width, verbosity_options, was_shown
+
+if TYPE_CHECKING:
+    from ..pipelines.run.reads import StageRecord
+    from ..pipelines.run.status import StageStatus
+
+KEY_FIGURES = {
+    "frames": ("frames", "keyframes_placed", "calibration", "focal_px", "focal_sd_px", "still_left_out", "gps"),
+    "proxy": ("depth", "semantics", "metric", "metres_per_unit", "classes"),
+    "tracking": ("posed", "keyframes", "lost", "scale"),
+    "mapping": ("gaussians", "keyframe_psnr"),
+    "global_ba": ("loops", "images_posed", "keyframe_psnr"),
+    "export": ("images", "vertices", "faces", "up", "floor", "gps"),
+}
+"""What a person wants to know first; `status -v` says all."""
 
 
 @click.command()
@@ -20,7 +38,6 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
     """Say which stages of RUN are done, what they found, what was degraded, and which files are damaged."""
     from ..pipelines.reconstruct import all_stages
     from ..pipelines.run.status import run_status
-    from .output import scale_lines, status_table, warning_lines
 
     run = open_run(run_path)
     found = run_status(run, all_stages)
@@ -176,3 +193,54 @@ def view(run_path: Path, port: int) -> None:
             server.serve_forever()
     except KeyboardInterrupt:
         return
+
+
+def status_table(stages: Sequence[StageStatus], everything: bool = False) -> str:
+    """One row a stage: state, seconds, peak memory, key figures or all of them."""
+    rows = []
+    for stage in stages:
+        if (record := stage.record) is None:
+            rows.append([stage.name, stage.state_text, "", "", ""])
+            continue
+        wanted = record.figures if everything else [k for k in KEY_FIGURES[stage.name] if k in record.figures]
+        figures = ", ".join(f"{key} {figure_text(record.figures[key], key)}" for key in wanted)
+        rows.append([stage.name, stage.state, f"{record.seconds:.1f}", f"{record.peak_memory_mb:.0f}", figures])
+    return format_table(["stage", "state", "seconds", "peak MB", "figures"], rows, terminal_width())
+
+
+def scale_lines(root: Path, records: dict[str, StageRecord]) -> list[str]:
+    """Return the line about the scale of the world; none before the export has estimated it."""
+    from ..pipelines.run.files import METRES
+    from ..pipelines.run.folder import RunFolder
+
+    metres = RunFolder(root).find(METRES) if "export" in records else None
+    return [] if metres is None else [f"\nScale: {metres.text}"]
+
+
+def warning_lines(records: dict[str, StageRecord], was_shown: Callable[[str], bool] = lambda text: False) -> list[str]:
+    """Every degraded result, by stage, that is not said yet."""
+    return [
+        f"warning ({n}): {text}" for n, record in records.items() for text in record.warnings if not was_shown(text)
+    ]
+
+
+def report_run(output: Output, root: Path, records: dict[str, Any]) -> None:
+    """Say how the run is now, for people unless they want errors only, and for programs."""
+    if not output.quiet:
+        print_summary(root, records)
+    output.report_result(run=root, **({"export": root / "export"} if "export" in records else {}))
+
+
+def print_summary(root: Path, records: dict[str, Any]) -> None:
+    """Print the table, what is not said yet, and where the results are."""
+    from ..pipelines.run.status import DONE, StageStatus
+
+    say(status_table([StageStatus(name, DONE, record) for name, record in records.items()]))
+    for line in warning_lines(records, was_shown):
+        say(line, err=True)
+    for line in scale_lines(root, records):
+        say(line)
+    if "export" in records:
+        say(f"\nResults: {root / 'export'} (README.txt there says what each file is for)")
+        if (page := root / "export" / "map.html").exists():
+            say(f"Open in a browser: {page}")

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from .pipelines.evaluation.views import MapView
-    from .pipelines.outcome import Outcome
+    from .pipelines.run.outcome import Outcome
     from .pipelines.system.progress import Progress
     from .pipelines.types import Intrinsics
 
@@ -50,8 +50,8 @@ class Run:
     @cached_property
     def outcome(self) -> Outcome:
         """All that the run has found; raises InputError where the folder is no run or its map is not done."""
-        from .pipelines.outcome import load_outcome
         from .pipelines.run.folder import RunFolder
+        from .pipelines.run.outcome import load_outcome
         from .pipelines.scene.world import WORLD
 
         found = load_outcome(RunFolder(self.path))
@@ -99,11 +99,10 @@ class Run:
 
 def open_run(path: Path | str) -> Run:
     """A finished run folder. Raises InputError where it is none, or its map is not done."""
-    from .pipelines.reconstruct import require_run
     from .pipelines.run.folder import RunFolder
 
     run = Run(Path(path))
-    require_run(RunFolder(run.path))
+    RunFolder(run.path).required()
     _ = run.outcome
     return run
 
@@ -121,10 +120,10 @@ def reconstruct(
     for bars on a terminal and a line a stage elsewhere, or an object with `track` and `stage`
     (`msgs_slam.pipelines.system.progress.Progress`). Raises InputError for a source or setting that cannot be used.
     """
-    from .pipelines.read_config import load_config, merge_with_quality
     from .pipelines.reconstruct import default_run_folder, existing_config
     from .pipelines.reconstruct import reconstruct as run_reconstruct
     from .pipelines.run.folder import RunFolder
+    from .pipelines.run.settings import load_config, merge_with_quality
 
     source = Path(source)
     run = RunFolder(Path(out)) if out is not None else default_run_folder(source)

@@ -1,4 +1,4 @@
-"""Every setting, its default and its meaning, once; `read_config` reads and writes them."""
+"""Every setting, its default and its meaning, once; `run/settings.py` reads and writes them."""
 
 from dataclasses import Field, dataclass, field, fields, is_dataclass
 from typing import Any
@@ -13,12 +13,11 @@ SOURCE_LIST = "source.videos"
 
 @dataclass(frozen=True)
 class Option:
-    """An option of the command line that gives a setting: its name without dashes, what stands for its value, and its
-    help; without these the setting's own choices and help."""
+    """An option of the command line that gives a setting: its name without dashes, and what stands for its value, where
+    that is not its choices."""
 
     name: str
     metavar: str = ""
-    help: str = ""
 
 
 def setting(
@@ -58,35 +57,22 @@ class RunConfig:
     """Settings of the whole run."""
 
     quality: str = setting(
-        "normal", "other values of the settings that say so; what is set besides stays. In a run: resume RUN --quality",
-        ("draft", "normal", "best"),
-        option=Option(
-            "quality",
-            help="draft: a third of the time or less, fewer keyframes and smaller images; best: larger images, more "
-            "passes, the largest networks that are installed. Options and settings that are given "
-            "besides win. Default: normal.",
-        ),
+        "normal", "draft: a third of the time or less, fewer keyframes and smaller images; best: larger images, more "
+        "passes, the largest networks that are installed. Other options and settings win",
+        ("draft", "normal", "best"), option=Option("quality"),
     )  # fmt: skip
     seed: int = setting(0, "seed of every random choice", within=(0, 2**31 - 1))
     threads: int = setting(0, "CPU threads, 0 = all cores; the same count gives the same bytes", within=(0, 1024))
     format: str = setting(
-        "auto", "layout of the source: a data set's; images = a video or plain images; auto looks",
+        "auto", "kind of source: images (a video or plain images, whatever is next to them), or a data set, which "
+        "gives its times and camera, and with proxy.depth=files proxy.semantics=files its depth and labels; auto looks",
         ("auto", "images", "7scenes", "replica", "tum", "euroc", "scannet", "sens", "nerfstudio", "colmap", "folder"),
-        option=Option(
-            "format", "NAME",
-            "Kind of SOURCE: auto, images (a video or plain images, whatever is next to them), or a data set: "
-            "7scenes, replica, tum, euroc, scannet, sens, nerfstudio, colmap, folder. Default: auto. A data set "
-            "gives its times and camera, and with --depth files --semantics files its depth and labels.",
-        ),
+        option=Option("format"),
     )  # fmt: skip
     method: str = setting(
-        "default", "paper: poses, map and loops by the equations of the paper, as printed; slower and less exact",
-        ("default", "paper"),
-        option=Option(
-            "method",
-            help="default, or paper: poses from the map alone, and the map, by the equations of the paper "
-            "MSGS-SLAM as printed, from each frame's own --depth and --semantics. Default: default.",
-        ),
+        "default", "paper: poses from the map alone, map and loops by the equations of the paper MSGS-SLAM as printed, "
+        "from each frame's own depth and semantics; slower and less exact", ("default", "paper"),
+        option=Option("method"),
     )  # fmt: skip
     kappa: float = setting(
         0.0, "κ of the paper's (7), with run.method=paper: how much less an occluder hides that disagrees with the "
@@ -94,7 +80,7 @@ class RunConfig:
     )  # fmt: skip
     device: str = setting(
         "auto", "where dense work runs; auto takes a GPU if there is one", ("auto", "cpu", "cuda"),
-        option=Option("device", help="Where dense work runs. Default: auto."),
+        option=Option("device"),
     )  # fmt: skip
     memory_mb: int = setting(
         0, "plan with this much memory: given, long recordings are made in parts that fit. 0 = half of the machine's",
@@ -116,31 +102,19 @@ class FramesConfig:
         960, "longer images are reduced to this many pixels on the long side", within=(64, 8192), draft=640, best=1280
     )
     intrinsics: str = setting(
-        "", "fx,fy,cx,cy[,k1,k2,p1,p2] in pixels of the source, or a file; empty = find them",
-        paths=("",),
-        option=Option(
-            "intrinsics", "FX,FY,CX,CY[,K1,K2,P1,P2]|FILE",
-            "The camera, in pixels of the source (first pixel's centre at 0.5, 0.5). Default: the data set's, EXIF, "
-            "else self-calibrated.",
-        ),
+        "", "the camera, in pixels of the source (first pixel's centre at 0.5, 0.5), or a file; empty = the data "
+        "set's, by EXIF, else self-calibrated", paths=("",),
+        option=Option("intrinsics", "FX,FY,CX,CY[,K1,K2,P1,P2]|FILE"),
     )  # fmt: skip
     camera: str = setting(
-        "auto", "auto: from the source's metadata; a panorama becomes six images, a fisheye of known lens one",
-        ("auto", "perspective", "equirectangular", "fisheye"),
-        option=Option(
-            "camera",
-            help="Kind of camera: equirectangular for whole 360° panoramas, fisheye for a lens given by --intrinsics "
-            "(k1 to k4 of OpenCV's fisheye). Default: auto, from the source's metadata.",
-        ),
+        "auto", "equirectangular for whole 360° panoramas, each of which becomes six images, fisheye for a lens given "
+        "by frames.intrinsics (k1 to k4 of OpenCV's fisheye); auto: from the source's metadata",
+        ("auto", "perspective", "equirectangular", "fisheye"), option=Option("camera"),
     )  # fmt: skip
     poses: str = setting(
-        "", "poses to start from: a COLMAP model, transforms.json, ARKit's JSON, TUM or 4x4 lines",
-        paths=("",),
-        option=Option(
-            "poses", "FILE|FOLDER",
-            "Camera poses by another program to start from: a COLMAP model, a transforms.json, ARKit's JSON, a TUM "
-            "trajectory or lines of 4x4 matrices. They may be inexact or incomplete.",
-        ),
+        "", "camera poses by another program to start from: a COLMAP model, a transforms.json, ARKit's JSON, a TUM "
+        "trajectory or lines of 4x4 matrices; they may be inexact or incomplete", paths=("",),
+        option=Option("poses", "FILE|FOLDER"),
     )  # fmt: skip
     rolling_shutter: str = setting(
         "auto", "seconds from a frame's first row to its last; auto finds them, where they explain something; off"
@@ -159,13 +133,8 @@ class FramesConfig:
         8, "each keyframe is matched with this many after it (and a few further ones)", within=(1, 1000), draft=6
     )
     masks: str = setting(
-        "", "folder of masks, NAME.png for each image or some; black pixels are ignored",
-        paths=("",),
-        option=Option(
-            "masks", "FOLDER",
-            "Folder of masks: NAME.png for an image NAME, or the frame's number for a video. Black pixels are "
-            "ignored.",
-        ),
+        "", "folder of masks for some or all images: NAME.png for an image NAME, or the frame's number for a video; "
+        "black pixels are ignored", paths=("",), option=Option("masks", "FOLDER"),
     )  # fmt: skip
     people: str = setting(
         "auto", "auto leaves out who moves, where networks for people are in the cache; mask everybody; keep nobody",
@@ -183,31 +152,17 @@ class ProxyConfig:
     """Proxy depth and semantics of every keyframe."""
 
     depth: str = setting(
-        "auto", "depth provider: auto, best (the largest network that is installed), multiview, files[:FOLDER], "
-        "onnx:CARD, a network's name",
-        paths=("files:", "onnx:"),
-        option=Option(
-            "depth", "PROVIDER",
-            "Proxy depth: auto, best (the largest network that is installed), multiview (needs no weights), "
-            "files[:FOLDER], onnx:CARD, or a network by its name in `models list`. Default: auto.",
-        ), best="best",
+        "auto", "proxy depth: auto, best (the largest network that is installed), multiview (needs no weights), "
+        "files[:FOLDER], onnx:CARD, or a network by its name in `models list`",
+        paths=("files:", "onnx:"), option=Option("depth", "PROVIDER"), best="best",
     )  # fmt: skip
     semantics: str = setting(
-        "auto", "semantics provider: auto, segments, files[:FOLDER], onnx:CARD, a network's name",
-        paths=("files:", "onnx:"),
-        option=Option(
-            "semantics", "PROVIDER",
-            "Semantics: auto, segments (needs no weights), files[:FOLDER], onnx:CARD, or a network by its name. "
-            "Default: auto.",
-        ),
+        "auto", "semantics: auto, segments (needs no weights), files[:FOLDER], onnx:CARD, or a network by its name",
+        paths=("files:", "onnx:"), option=Option("semantics", "PROVIDER"),
     )  # fmt: skip
     classes: str = setting(
-        "", "words to look for, comma-separated, for a network that compares images with words",
-        option=Option(
-            "classes", "WORDS",
-            'What to look for, "radiator, bookshelf, lamp", by a --semantics network whose card names a text '
-            "encoder.",
-        ),
+        "", 'what to look for, "radiator, bookshelf, lamp", by a network for semantics whose card names a text encoder',
+        option=Option("classes", "WORDS"),
     )  # fmt: skip
     max_side: int = setting(
         640, "the maps are at most this many pixels on the long side", within=(64, 8192), draft=320, best=960
@@ -217,12 +172,7 @@ class ProxyConfig:
         "",
         "what makes metres without metric depth: IMAGE:X1,Y1,X2,Y2=METRES, two pixels of one image of the source "
         "(an image's name or a video frame's number; the first pixel's centre is 0.5,0.5), height=METRES of the "
-        "camera over the floor, or poses: those of frames.poses are in metres",
-        option=Option(
-            "scale-ref", "REF",
-            "Metres without metric depth: IMAGE:X1,Y1,X2,Y2=METRES, two pixels of one image, height=METRES, or "
-            "poses: those of --poses are in metres.",
-        ),
+        "camera over the floor, or poses: those of frames.poses are in metres", option=Option("scale-ref", "REF"),
     )  # fmt: skip
     stereo_side: int = setting(
         640, "multiview matches images of this many pixels on the long side", within=(32, 4096), draft=320, best=960
@@ -244,13 +194,10 @@ class MappingConfig:
     )
     hold_out: int = setting(
         0,
-        "every n-th frame is never used for the map, only to measure it; 0 = use all",
+        "every n-th frame is never used for the map, only to measure it (evaluate); 0 = use all",
         within=(2, 1_000_000),
         or_zero=True,
-        option=Option(
-            "hold-out", "N",
-            "Keep every N-th frame out of the map, to measure it there (evaluate). Default: 0, use all.",
-        ),
+        option=Option("hold-out", "N"),
     )  # fmt: skip
     passes: float = setting(
         9.0, "how often each keyframe is visited once all are seeded", within=(0, 1000), draft=6.0, best=14.0
@@ -270,13 +217,8 @@ class GlobalBaConfig:
     """Loops and the global adjustment."""
 
     posed: str = setting(
-        "every", "every: the images of the source between the picked frames get a pose too; picked: those frames alone",
-        ("every", "picked"),
-        option=Option(
-            "pose-frames",
-            help="Give a pose to every image of a video, those between the picked frames too, or to the picked ones "
-            "(frames.rate a second) alone. Default: every.",
-        ), draft="picked",
+        "every", "every: all images of a video get a pose, those between the picked frames (frames.rate a second) too; "
+        "picked: those frames alone", ("every", "picked"), option=Option("pose-frames"), draft="picked",
     )  # fmt: skip
 
 
@@ -291,13 +233,10 @@ class ExportConfig:
     )
     gps: str = setting(
         "auto",
-        "x east, y north, metres: auto by GPS in the images' EXIF, off, or a track (GPX, or CSV of time, lat, lon)",
+        "georeferences the export (x east, y north, metres): auto by GPS in the images' EXIF, off, or a track, GPX or "
+        "CSV with the columns time, lat, lon, alt (a video counts from its start)",
         paths=("",),
-        option=Option(
-            "gps", "FILE",
-            "Location, to georeference the export (x east, y north, metres): a GPX track, or a CSV with the columns "
-            "time, lat, lon, alt (a video counts from its start). Default: auto, the images' EXIF; off for neither.",
-        ),
+        option=Option("gps", "FILE"),
     )  # fmt: skip
     voxel: float = setting(
         0.008, "voxel of the mesh, in units of the scene's median depth", within=(0.0005, 1), draft=0.014
@@ -312,13 +251,10 @@ class ExportConfig:
     )
     scale: str = setting(
         "auto",
-        "where metres are unknown, auto estimates how long a unit is, by a network and usual sizes; free does not",
+        "where metres are unknown, auto estimates how long a unit is, by a network and usual sizes; free does not; "
+        "neither rescales coordinates",
         ("auto", "free"),
-        option=Option(
-            "scale",
-            help="auto: estimate metres per unit where neither metric depth nor --scale-ref gives them; free: do not. "
-            "Neither rescales coordinates. Default: auto.",
-        ),
+        option=Option("scale"),
     )  # fmt: skip
     texture: bool = setting(
         True, "mesh.glb has a texture of the keyframes; false: all vertices, with their colours", draft=False

@@ -12,7 +12,7 @@ def plain_descend(
     value: Tensor, gradient: Tensor, first: Tensor, second: Tensor, rate: float, steps: int, shares: Tensor | None,
     rows: Tensor | None = None,
 ) -> None:  # fmt: skip
-    """As `pipelines.compute.adam.descend`."""
+    """As `pipelines.system.adam.descend`."""
     if rows is not None:
         parts = [x[rows] for x in (value, first, second)]
         plain_descend(parts[0], gradient, parts[1], parts[2], rate, steps, shares)

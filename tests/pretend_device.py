@@ -16,12 +16,11 @@ import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map
 
-from msgs_slam.pipelines import outcome
-from msgs_slam.pipelines.compute import adam, gpu
 from msgs_slam.pipelines.mapping import submap_tasks
 from msgs_slam.pipelines.render import api, cpu, inspection
 from msgs_slam.pipelines.render.rules import GaussianStats
-from msgs_slam.pipelines.run import stages
+from msgs_slam.pipelines.run import outcome, stages
+from msgs_slam.pipelines.system import adam, gpu
 from tests.plain_adam import plain_descend
 
 DEVICE = "meta"

@@ -17,7 +17,7 @@ import pytest
 
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.read_config import load_config
+from msgs_slam.pipelines.run.settings import load_config
 
 ROOT = Path(__file__).resolve().parents[1]
 SITE = ROOT / "docs"

@@ -7,7 +7,7 @@ import numpy as np
 
 from msgs_slam.formats.atomic import write_text
 from msgs_slam.pipelines.export.scene import ExportScene
-from msgs_slam.pipelines.outcome import map_cloud
+from msgs_slam.pipelines.run.outcome import map_cloud
 from msgs_slam.pipelines.run.target import Target
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
-from msgs_slam.pipelines.providers import DepthEstimate, DepthProvider, Sequence
+from msgs_slam.pipelines.geometry.sequence import Sequence
+from msgs_slam.pipelines.providers import DepthEstimate, DepthProvider
 from msgs_slam.pipelines.proxy.selection import ProviderContext
 from msgs_slam.pipelines.types import Frame
 

@@ -16,7 +16,8 @@ from ...formats.images import MAX_IMAGE_PIXELS, image_size, read_depth_png, read
 from ...formats.reading import home_expanded, note_read, parsing, reaching, require_file
 from ...formats.tensors import HEADERS
 from ..geometry.camera import resample_nearest, resize_depth
-from ..providers import DepthEstimate, DepthProvider, Sequence
+from ..geometry.sequence import Sequence
+from ..providers import DepthEstimate, DepthProvider
 from ..types import Frame, Intrinsics
 
 _KINDS = r"(colou?r|rgb|image|img|depth|disp|labels?|semantic|segmentation|class|conf|confidence)"

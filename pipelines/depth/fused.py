@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.camera import project, resize_depth
-from ..providers import DepthEstimate, DepthProvider, Sequence
+from ..geometry.sequence import Sequence
+from ..providers import DepthEstimate, DepthProvider
 from ..system.parallel import LruCache
 from ..types import Frame
 from .align import SAMPLES_ACROSS, Anchors, FieldModel, fit_fields, kept_views, keyframe_anchors, posed_small

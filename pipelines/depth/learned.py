@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError
+from ..geometry.sequence import Sequence
 from ..networks.card import Card
 from ..networks.network_pass import Arrays, NetworkPass, Workplace
 from ..networks.outputs import network_depth
 from ..networks.session import Network, card_identity
-from ..providers import DepthEstimate, DepthProvider, Sequence
+from ..providers import DepthEstimate, DepthProvider
 from ..types import Frame
 from .fused import depth_at_points
 

@@ -13,8 +13,8 @@ from ...formats.datasets import Dataset
 from ...formats.errors import InputError
 from ..geometry import se3
 from ..mapping.division import split_frames
-from ..outcome import Outcome, spread_sample
 from ..render.api import Rendering, render
+from ..run.outcome import Outcome, spread_sample
 from ..sfm.lens import FramePixels
 from ..system.progress import Progress, SilentProgress, log
 from ..types import Trajectory

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..geometry.camera import rig_of
 from ..geometry.sparse_model import SparseModel
-from ..outcome import Outcome
+from ..run.outcome import Outcome
 from ..scene.world import WORLD, in_world
 from ..types import Array, LoopEdge, Metres
 

@@ -18,8 +18,8 @@ from ...formats.images import write_rgb
 from ...formats.textfile import number, read_json_object
 from ...formats.video_streams import CODECS, PLAYED, write_browser_video, write_video
 from ..export.web_page import EXPORTED, RUN
-from ..outcome import Outcome, load_outcome
 from ..run.folder import RunFolder
+from ..run.outcome import Outcome, load_outcome
 from ..run.target import Target
 from ..scene.world import WORLD, up_in_run
 from ..source.recording import is_of_source

@@ -14,14 +14,14 @@ from scipy.spatial import cKDTree
 
 from ...formats.errors import InputError, install_extra
 from ...formats.reading import file_sha256
-from ..compute.ssim import TAPS, similarity
 from ..geometry.posed_depth import PosedDepth
 from ..geometry.voxels import voxel_keys
 from ..networks.registry import Model, ModelStore
 from ..networks.runtime import open_runtime
-from ..outcome import Outcome, spread_sample
 from ..run.files import MESH
+from ..run.outcome import Outcome, spread_sample
 from ..scene.world import FIRST, WORLD
+from ..system.ssim import TAPS, similarity
 from ..types import Intrinsics, require_shape
 from .truth import AbsoluteError, MatchedTruth
 

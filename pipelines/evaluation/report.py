@@ -18,10 +18,10 @@ from ..config import Config, config_to_dict
 from ..export.kinds import IMAGES, README, WEB_PAGE
 from ..export.scene import lengths
 from ..geometry.sparse_model import SparseModel
-from ..outcome import Outcome, load_outcome, spread_sample
-from ..read_config import config_to_toml
 from ..run.files import FIGURES, LOOPS
-from ..run.folder import RunFolder, load_source
+from ..run.folder import RunFolder
+from ..run.outcome import Outcome, load_outcome, spread_sample
+from ..run.settings import config_to_toml
 from ..run.target import LIST, Target
 from ..scene.world import WORLD, in_world
 from ..source.picking import at_most_wide
@@ -98,7 +98,7 @@ def _heading(outcome: Outcome, target: Path) -> str:
         apart = sum(int(p.trajectory.is_posed.sum()) for p in pieces)
         pairs.append((f"frames in {len(pieces)} further {'piece' if len(pieces) == 1 else 'pieces'}", str(apart)))
     pairs.append(("seconds", f"{sum(r.seconds for r in outcome.records.values()):.0f}"))
-    source = escape(str(load_source(outcome.run).path))
+    source = escape(str(outcome.run.source.path))
     after = _AFTER.get(outcome.map_stage or outcome.pose_stage, "")
     head, run = f'<h1>{escape(outcome.run.place.name)}</h1><p class="sub">Source: {source}{after}</p>', outcome.run
     in_run = target.resolve().parent == run.root.resolve() and run.has("export", WEB_PAGE)

@@ -19,13 +19,13 @@ from ..config import STAGES
 from ..export.kinds import WEB_PAGE
 from ..export.web_page import PARTS, page_of
 from ..geometry.sparse_model import SparseModel
-from ..outcome import Outcome, load_outcome, runs_of_pieces
-from ..reconstruct import require_run
 from ..render.gaussian_map import GaussianMap
 from ..run.files import BACKBONE, CALIBRATION, FRAMES
-from ..run.folder import RunFolder, load_records, load_settings
-from ..run.manifest import StageRecord, recorded_config
+from ..run.folder import RunFolder
+from ..run.manifest import recorded_config
+from ..run.outcome import Outcome, load_outcome, runs_of_pieces
 from ..run.progress import load_run_progress
+from ..run.reads import StageRecord
 from ..scene.world import WORLD, Upright, in_world, up_in_run, upright_world
 from ..system.progress import log
 from ..system.wording import quoted
@@ -52,7 +52,7 @@ _NOTHING = "<!doctype html><meta charset=utf-8><body style='font:15px sans-serif
 
 def progress_summary(run: RunFolder) -> str:
     """Say in a line what is shown of a run and what is still to come; "" for a finished one."""
-    records = load_records(run)
+    records = run.records
     left = [name for name in STAGES if name not in records]
     if not left:
         return ""
@@ -70,7 +70,7 @@ def page_of_run(run: RunFolder) -> str:
 
     Raises InputError for what is damaged, and where nothing can be shown yet.
     """
-    records = load_records(run)
+    records = run.records
     if run.has("export", WEB_PAGE):
         return read_bytes(run.file("export", WEB_PAGE)).decode("utf-8")
     outcome = load_outcome(run) if "tracking" in records else _after_frames(run, records)
@@ -94,7 +94,7 @@ def _after_frames(run: RunFolder, records: dict[str, StageRecord]) -> Outcome:
     times = np.array([frames[i].timestamp for i in model.frame_ids])
     trajectory = Trajectory(model.frame_ids, times, model.cam_from_world, np.ones(count, bool), ("",) * count)
     outcome = Outcome(
-        run, records, recorded_config(records, load_settings(run)), frames, run.load(CALIBRATION), "frames", trajectory,
+        run, records, recorded_config(records, run.settings()), frames, run.load(CALIBRATION), "frames", trajectory,
         "", None, ClassTable((), ()), np.zeros(0, np.uint8), None, False, "", (),
     )  # fmt: skip
     return _with_points(outcome, model)
@@ -123,7 +123,7 @@ class PageServer(ThreadingHTTPServer):
 
     def __init__(self, run: RunFolder, port: int = 0) -> None:
         """port: 0 = any that is free. Raises InputError for a folder that is no run, and a port that is taken."""
-        require_run(run)
+        run.required()
         self.run, self._lock = run, threading.Lock()
         self._pages: dict[str, tuple[str, str]] = {}
         try:
@@ -138,8 +138,8 @@ class PageServer(ThreadingHTTPServer):
 
     def parts(self) -> dict[str, RunFolder]:
         """Return the run and its pieces that have a map, by the names that they are served under."""
-        pieces = runs_of_pieces(self.run, load_records(self.run))
-        return {"map": self.run} | {p.place.name: p for p in pieces if "mapping" in load_records(p)}
+        pieces = runs_of_pieces(self.run, self.run.records)
+        return {"map": self.run} | {p.place.name: p for p in pieces if "mapping" in p.records}
 
     def state(self) -> str:
         """Return as JSON what is said of the run, and a number for each part that changes with what its page shows."""
@@ -166,7 +166,7 @@ class PageServer(ThreadingHTTPServer):
 
 def _version(run: RunFolder) -> str:
     """Changes with the files of every stage whose results are shown."""
-    seen = {name: record.content for name, record in load_records(run).items() if name != "proxy"}
+    seen = {name: record.content for name, record in run.records.items() if name != "proxy"}
     return hashlib.sha256(json.dumps(seen).encode()).hexdigest()[:16]
 
 

@@ -18,7 +18,7 @@ from ...formats.textfile import read_rows
 from ...formats.trajectory import read_trajectory
 from ..geometry import se3
 from ..geometry.se3 import Similarity, align_points
-from ..outcome import Outcome, spread_sample
+from ..run.outcome import Outcome, spread_sample
 from ..source.recording import written_name
 from ..types import Array, Frame, require_shape
 

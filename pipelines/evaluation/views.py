@@ -11,11 +11,11 @@ import torch
 from numpy.typing import NDArray
 
 from ...formats.glb import TexturedMesh
-from ..compute.raster import draw_faces
-from ..outcome import Exposure, Outcome, labels_of_channels, spread_sample
 from ..providers import class_colors
 from ..render.gaussian_map import GaussianMap
 from ..render.inspection import render_all
+from ..run.outcome import Exposure, Outcome, labels_of_channels, spread_sample
+from ..system.raster import draw_faces
 from ..types import VOID, Array, ClassTable, Intrinsics
 
 Picture = NDArray[np.uint8]

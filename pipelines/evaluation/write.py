@@ -16,9 +16,9 @@ from ...formats.images import write_rgb
 from ...formats.textfile import write_json
 from ...formats.video import VideoReader
 from ..geometry.se3 import align_points
-from ..outcome import Outcome, load_outcome, spread_sample
 from ..run.files import MESH
 from ..run.folder import RunFolder
+from ..run.outcome import Outcome, load_outcome, spread_sample
 from ..sfm.lens import FramePixels
 from ..system.progress import Progress
 from ..system.wording import markdown_table

@@ -21,19 +21,18 @@ from ...formats.images import write_rgb
 from ...formats.ply import write_point_ply
 from ...formats.trajectory import write_tum
 from ...formats.video import VideoFrame
-from ..compute.threads import get_threads
 from ..geometry.camera import rig_of
 from ..geometry.se3 import Similarity
 from ..geometry.sparse_model import FrameObservations, SparseModel
-from ..outcome import Outcome
 from ..render.gaussian_map import GaussianMap
 from ..run.files import LEFT_OUT
-from ..run.folder import load_source
+from ..run.outcome import Outcome
 from ..run.target import Target
 from ..sfm.lens import Lens, distorted_camera, make_lens, to_pycolmap
 from ..source.picking import reduce_image, reduced_size
 from ..source.recording import Recording, open_recording
 from ..system.parallel import parallel_map
+from ..system.threads import get_threads
 from ..system.wording import stretches
 from ..types import Frame, Intrinsics
 from .kinds import IMAGES
@@ -186,7 +185,7 @@ def _larger(outcome: Outcome, side: int) -> tuple[Recording, Lens] | None:
     k = calibration.intrinsics
     if calibration.directions > 1 or calibration.fisheye or max(k.width, k.height) < most:
         return None
-    source = open_recording(Path(load_source(outcome.run).path), outcome.config.run.format)
+    source = open_recording(Path(outcome.run.source.path), outcome.config.run.format)
     width, height = reduced_size(source.width, source.height, side)
     if reduced_size(source.width, source.height, most) != (k.width, k.height) or width <= k.width:
         return None

@@ -16,18 +16,17 @@ from scipy.spatial import cKDTree
 
 from ...formats.glb import write_mesh_glb, write_textured_glb
 from ...formats.ply import mesh_blocks, read_mesh_ply, write_mesh_ply
-from ..compute.threads import get_threads, host_threads
 from ..config import ExportConfig
 from ..geometry.camera import resample_nearest, unproject_depth
 from ..geometry.posed_depth import PosedDepth
 from ..geometry.voxels import VOXELS_PER_DEPTH, Voxels, find, gather_depths, neighbour_keys, normals_in_cam, voxel_keys
 from ..mapping.measure import DepthViews, MeshView, mesh_view
-from ..outcome import Outcome, load_outcome, maps_around, spread_sample
-from ..run.stages import StageContext
+from ..run.outcome import Outcome, load_outcome, maps_around, spread_sample
+from ..run.stages import Chunk, StageContext, in_chunks
 from ..run.target import Target
-from ..run.tasks import Chunk, in_chunks
 from ..system.parallel import LruSequence, map_lookahead
 from ..system.progress import Progress
+from ..system.threads import get_threads, host_threads
 from ..system.values import load_value, save_value
 from ..types import VOID, Array
 from .scene import ExportScene

@@ -12,9 +12,9 @@ from ...formats.ply import MeshArrays, read_mesh_ply
 from ...formats.splats import GaussianCloud
 from ..config import ExportConfig
 from ..networks.registry import metric_card
-from ..outcome import Outcome, map_cloud
 from ..run.files import MESH
 from ..run.folder import RunFolder
+from ..run.outcome import Outcome, map_cloud
 from ..run.stages import StageContext
 from ..scene.gps import world_on_earth
 from ..scene.metres import find_metres

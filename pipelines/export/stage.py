@@ -20,7 +20,6 @@ from ...formats.atomic import copy_file, write_text
 from ...formats.errors import InputError, RecoverableError
 from ..config import STAGES, Config, ExportConfig
 from ..networks.registry import ModelStore
-from ..outcome import load_outcome
 from ..run.ending import discard
 from ..run.files import (
     BACKBONE,
@@ -38,8 +37,9 @@ from ..run.files import (
     VOCABULARY,
     save_frames,
 )
-from ..run.folder import RunFolder, load_records
+from ..run.folder import RunFolder
 from ..run.manifest import piece_digest
+from ..run.outcome import load_outcome
 from ..run.runner import run_stages
 from ..run.stages import Stage, StageContext
 from ..run.target import Target, read_list
@@ -248,7 +248,7 @@ def licences(figures: Iterable[Mapping[str, Any]], metres: Metres | None) -> str
 def write_pieces(context: StageContext) -> None:
     """Make the pieces, and write piece_2 and so on: each with all the files of an export, or with its poses."""
     for piece in make_pieces(context):
-        if "export" in (records := load_records(piece)):
+        if "export" in (records := piece.records):
             for name in records["export"].files:
                 copy_file(piece.file("export", name), context.folder / piece.root.name / name)
         elif "tracking" in records:
@@ -265,14 +265,15 @@ def make_pieces(context: StageContext) -> list[RunFolder]:
     for old in run.root.glob("piece_[0-9]*"):
         if old.name not in names and RunFolder(old).manifest_file.exists():
             discard(old)
-    records, made = load_records(run), []
+    records, made = run.records, []
     for name in names:
         piece = run.piece(name)
         piece.root.mkdir(exist_ok=True)
         stages = [Stage("frames", take_frames), *context.stages[1:]]
         try:
-            inside = WithinStage(context.progress, name)
-            run_stages(stages, piece, context.source, piece_digest(records, name), _settings(context.config), inside)
+            settings, inside = _settings(context.config), WithinStage(context.progress, name)
+            work = StageContext(piece, context.source, settings, piece.root, inside, stages=stages)
+            run_stages(work, piece_digest(records, name))
         except RecoverableError:
             raise
         except InputError as error:
@@ -295,17 +296,17 @@ def take_frames(context: StageContext) -> dict[str, Any]:
     for frame in (frames[i] for i in posed):
         copy_file(around.image_file(frame), context.folder / frame.name)
         if (mask := around.find(LEFT_OUT, of=frame.name)) is not None:
-            LEFT_OUT.save(context.folder, mask, frame.name)
+            context.save(LEFT_OUT, mask, frame.name)
     save_frames(context.folder, [replace(frames[old], id=new) for old, new in number.items()])
-    CALIBRATION.save(context.folder, around.load(CALIBRATION))
+    context.save(CALIBRATION, around.load(CALIBRATION))
     model = around.load(SPARSE, "tracking", piece=name)
-    BACKBONE.save(context.folder, replace(model, frame_ids=np.array([number[i] for i in model.frame_ids.tolist()])))
+    context.save(BACKBONE, replace(model, frame_ids=np.array([number[i] for i in model.frame_ids.tolist()])))
     for old, new in number.items():
         if (features := around.find(FEATURES, of=old)) is not None:
-            FEATURES.save(context.folder, features, of=new)
+            context.save(FEATURES, features, of=new)
     tried = {
         (number[i], number[j]): n for (i, j), n in around.load(MATCHED_PAIRS).items() if i in number and j in number
     }
-    VOCABULARY.save(context.folder, around.load(VOCABULARY))
-    MATCHED_PAIRS.save(context.folder, tried)
+    context.save(VOCABULARY, around.load(VOCABULARY))
+    context.save(MATCHED_PAIRS, tried)
     return {"frames": len(posed), "keyframes": len(model.frame_ids), "of_the_run": [posed[0], posed[-1]]}

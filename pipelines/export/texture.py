@@ -12,14 +12,14 @@ from scipy.spatial import cKDTree
 
 from ...formats.glb import TexturedMesh
 from ...formats.ply import MeshArrays
-from ..compute.raster import draw_faces
-from ..compute.threads import for_each
 from ..geometry.camera import resample_nearest
 from ..geometry.posed_depth import PosedDepth
-from ..outcome import Outcome
+from ..run.outcome import Outcome
 from ..system.jit import kernel
 from ..system.parallel import LruSequence
 from ..system.progress import Progress
+from ..system.raster import draw_faces
+from ..system.threads import for_each
 from ..types import Frame, Intrinsics
 from .surface import filled, normal_sums
 

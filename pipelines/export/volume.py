@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.splats import morton_codes
-from ..compute.threads import for_each, fused_kernel, get_threads
 from ..geometry.camera import unproject_depth
 from ..geometry.posed_depth import PosedDepth
 from ..geometry.voxels import cells_of, voxel_keys
+from ..system.threads import for_each, fused_kernel, get_threads
 from ..types import Intrinsics
 
 SIDE = 8

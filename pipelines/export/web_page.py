@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from ...formats.atomic import require_room, write_text
 from ...formats.splats import GaussianCloud, morton_order
 from ..geometry.camera import rig_of
-from ..outcome import Outcome, map_cloud, spread_sample
 from ..run.folder import RunFolder
+from ..run.outcome import Outcome, map_cloud, spread_sample
 from ..run.target import Target
 from ..scene.world import SAME, Z_UP_FROM_Y_DOWN, World
 from ..types import VOID

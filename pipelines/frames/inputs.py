@@ -9,7 +9,7 @@ from ...formats.errors import InputError
 from ...formats.image_folder import hint_at_inner_folder
 from ..config import Config
 from ..run.files import CALIBRATION
-from ..run.folder import RunFolder, load_records
+from ..run.folder import RunFolder
 from ..source.files import Warn
 from ..source.given import check_poses, read_intrinsics
 from ..source.recording import FolderRecording, Recording, open_recording
@@ -20,7 +20,7 @@ from .masks import check_masks
 
 def frames_division(run: RunFolder, config: Config) -> list[range]:
     """Return the windows of structure from motion, which are smaller for less memory: other ones give other poses."""
-    calibration, figures = run.load(CALIBRATION), load_records(run)["frames"].figures
+    calibration, figures = run.load(CALIBRATION), run.records["frames"].figures
     pixels = calibration.intrinsics.width * calibration.intrinsics.height
     size = window_size(config.run.memory_mb, pixels)
     return windows_of(figures.get("keyframes", 0), size) if calibration.directions == 1 else []

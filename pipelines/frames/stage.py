@@ -16,8 +16,7 @@ from ...formats.textfile import read_json, write_json
 from ..geometry.camera import rig_of
 from ..masks.static import find_static
 from ..run.files import BACKBONE, CALIBRATION, FEATURES, GIVEN_POSES, MATCHED_PAIRS, SPARSE, VOCABULARY, save_frames
-from ..run.stages import StageContext
-from ..run.tasks import in_chunks
+from ..run.stages import StageContext, in_chunks
 from ..sfm.driver import Structure
 from ..sfm.flow import Picture
 from ..sfm.lens import distortion_of, make_lens
@@ -240,14 +239,14 @@ class FramesStage:
 
     def save(self) -> dict[str, Any]:
         """Write what the next stages read; returns the figures."""
-        folder = self.context.folder
+        context = self.context
         self._save_models()
         self._save_correspondences()
-        masked = self.masks.write(folder, self.frames, self.lens)
-        CALIBRATION.save(folder, self.calibration)
-        save_frames(folder, self.frames)
+        masked = self.masks.write(context.folder, self.frames, self.lens)
+        context.save(CALIBRATION, self.calibration)
+        save_frames(context.folder, self.frames)
         if self.given is not None:
-            GIVEN_POSES.save(folder, self.given)
+            context.save(GIVEN_POSES, self.given)
         figures = _figures(self.frames, self.structure, self.calibration)
         figures |= self.of_given | places_figure(self.recording, self.frames)
         figures |= ({} if self.recording.is_timed() else {"timed": False}) | masked | self.still.figures
@@ -260,10 +259,10 @@ class FramesStage:
         model = to_sparse_model(self.structure.model, self.keyframes, self.lens, load_rgb)
         if self.given is not None and is_extension(self.context.source):
             model = in_world_of(self.given, model)
-        BACKBONE.save(self.context.folder, model)
+        self.context.save(BACKBONE, model)
         for number, piece in enumerate(self.structure.pieces, 2):
-            piece_folder = self.context.folder / f"piece_{number}"
-            SPARSE.save(piece_folder, to_sparse_model(piece, self.keyframes, self.lens, load_rgb))
+            sparse = to_sparse_model(piece, self.keyframes, self.lens, load_rgb)
+            self.context.save(SPARSE, sparse, piece=f"piece_{number}")
 
     def _save_correspondences(self) -> None:
         """What the stages after this one need of features and matches, in undistorted pixels."""
@@ -273,11 +272,11 @@ class FramesStage:
             # What a lens of much distortion cannot have seen lies nowhere in the picture.
             straight = self.lens.undistort_points(features.xy)
             keypoints[:, :2] = np.nan_to_num(straight, nan=-1.0, posinf=-1.0, neginf=-1.0)
-            FEATURES.save(self.context.folder, replace(features, keypoints=keypoints), of=frame_id)
+            self.context.save(FEATURES, replace(features, keypoints=keypoints), of=frame_id)
         found = {(p.first, p.second): len(p.matches) for p in structure.pairs}
         tried = {(keyframes[i], keyframes[j]): found.get((i, j), 0) for i, j in structure.tried}
-        VOCABULARY.save(self.context.folder, structure.vocabulary)
-        MATCHED_PAIRS.save(self.context.folder, tried)
+        self.context.save(VOCABULARY, structure.vocabulary)
+        self.context.save(MATCHED_PAIRS, tried)
 
 
 def places_figure(recording: Recording, frames: list[Frame]) -> dict[str, str]:

@@ -10,8 +10,7 @@ import pycolmap
 from ...formats.datasets.sequence import Camera
 from ...formats.images import read_rgb
 from ..geometry.camera import Rig, rig_of
-from ..run.stages import StageContext
-from ..run.tasks import Chunk
+from ..run.stages import Chunk, StageContext
 from ..sfm.driver import Divide, StructureFromMotion, no_prefetch
 from ..sfm.features import clear_of
 from ..sfm.lens import FOCAL_GUESS, to_pycolmap, unknown_camera

@@ -84,7 +84,7 @@ def pose_every_frame(context: StageContext, model: SparseModel, trajectory: Traj
             f"source: {stretches(lost)})"
         )
     every = with_placed(context.run, trajectory, placed)
-    EVERY_FRAME.save(context.folder, every)
+    context.save(EVERY_FRAME, every)
     return {"images": len(every.frame_ids), "images_posed": int(every.is_posed.sum())}
 
 

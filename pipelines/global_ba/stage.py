@@ -72,7 +72,7 @@ def run(context: StageContext) -> dict[str, Any]:
         gaussian_map = move_map(gaussian_map, model.frame_ids, before, after, ratio)
         model = sparse_model_of(closed.state)
         fields = align_depths(model, closed.report, context.run.load(CALIBRATION).intrinsics, context.run.find_proxy)
-    DEPTH_FIELDS.save(context.folder, fields)
+    context.save(DEPTH_FIELDS, fields)
     refined = None
     if moved_px >= JOINT_PX:
         if gaussian_map is None:
@@ -80,7 +80,7 @@ def run(context: StageContext) -> dict[str, Any]:
         refined = refine_map(context, gaussian_map, trajectory, fields, JOINT_PASSES)
     figures, trajectory = save(context, model, trajectory, gaussian_map, found, closed, refined, moved_px)
     figures |= pose_every_frame(context, model, trajectory)
-    FIGURES["global_ba"].save(context.folder, figures)
+    context.save(FIGURES["global_ba"], figures)
     return figures
 
 
@@ -217,14 +217,14 @@ def save(
         gaussian_map = result.gaussian_map
         trajectory = move_trajectory(trajectory, exposure["frame_ids"], result.cam_from_world)
         exposure |= {"log_gains": result.log_gains, "offsets": result.offsets}
-    TRAJECTORY.save(context.folder, trajectory)
-    SPARSE.save(context.folder, model)
+    context.save(TRAJECTORY, trajectory)
+    context.save(SPARSE, model)
     if gaussian_map is None:
         copy_file(context.run.file("mapping", MAP.name), MAP.path(context.folder))
     else:
-        MAP.save(context.folder, gaussian_map)
-    EXPOSURE.save(context.folder, exposure)
-    LOOPS.save(context.folder, [loop.edge for loop in found.loops] if closed is not None else [])
+        context.save(MAP, gaussian_map)
+    context.save(EXPOSURE, exposure)
+    context.save(LOOPS, [loop.edge for loop in found.loops] if closed is not None else [])
     kept = refined is not None and refined.is_better
     figures = ({"keyframe_psnr": round(refined.psnr_after, 5)} if refined is not None and kept else {}) | {
         "candidates": found.tried,

@@ -13,7 +13,8 @@ from ...formats.errors import InputError
 from ...formats.images import read_label_png
 from ..depth.files import as_read, find_folder, match_files, require_aspect
 from ..geometry.camera import resample_nearest
-from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, Sequence, class_colors
+from ..geometry.sequence import Sequence
+from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, class_colors
 from ..system.progress import Progress
 from ..types import VOID, ClassTable, Frame
 

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError
+from ..geometry.sequence import resample_linear
 from ..networks.card import Card
 from ..networks.network_pass import Arrays, NetworkPass, Workplace
 from ..networks.outputs import best_classes, class_token, network_probabilities, patch_features, softmax
 from ..networks.session import Network, card_identity
-from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, class_colors, resample_linear
+from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, class_colors
 from ..types import VOID, ClassTable, Frame
 from .named import NamedScene, NetworkClasses
 from .segments import SegmentLabels

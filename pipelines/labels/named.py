@@ -18,8 +18,9 @@ from scipy.sparse.csgraph import connected_components
 
 from ..geometry.camera import resample_nearest, unproject_depth
 from ..geometry.room_layout import FLOOR, Gravity
+from ..geometry.sequence import Sequence, resample_linear
 from ..geometry.voxels import Voxels, find, find_near, select_voxels, touching, voxel_keys
-from ..providers import DepthEstimate, LabelEstimate, Sequence, resample_linear
+from ..providers import DepthEstimate, LabelEstimate
 from ..types import Frame
 from .segments import SegmentLabels, cut_parts, cut_patches, label_pixels
 

@@ -15,6 +15,7 @@ from ...formats.errors import InputError
 from ..depth.completion.fill import domain_transform_in_place
 from ..geometry.camera import resample_nearest, unproject_depth
 from ..geometry.room_layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
+from ..geometry.sequence import Sequence
 from ..geometry.voxels import (
     MIN_WEIGHT,
     VOXELS_PER_DEPTH,
@@ -26,7 +27,7 @@ from ..geometry.voxels import (
     touching,
     voxel_keys,
 )
-from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, Sequence, class_colors
+from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, class_colors
 from ..system.jit import kernel
 from ..system.machine import release_free_memory
 from ..system.progress import Progress

@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..compute.lanes import iota, load, splat, store, total, where
-from ..compute.ssim import C1, C2, blur_array, ssim_map
-from ..compute.threads import for_each, fused_kernel, inner
+from ..system.lanes import iota, load, splat, store, total, where
+from ..system.ssim import C1, C2, blur_array, ssim_map
+from ..system.threads import for_each, fused_kernel, inner
 
 SSIM_WEIGHT = 0.2
 """Share of 1 - SSIM in eq. (20)."""
@@ -165,7 +165,7 @@ def _similarity(
 ) -> None:  # fmt: skip
     """The derivatives of a band's similarity by mean, variance and covariance, into planes 2 to 4, and its sum.
 
-    As `pipelines.compute.ssim.similarity`, with one division.
+    As `pipelines.system.ssim.similarity`, with one division.
     """
     size = planes.shape[1]
     flat, out = moments.reshape(-1), planes.reshape(-1)

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..compute.ssim import ssim_map
 from ..geometry.posed_depth import PosedDepth
 from ..render.gaussian_map import GaussianMap
 from ..render.inspection import render_all
+from ..system.ssim import ssim_map
 from ..types import VOID, Intrinsics
 from .views import View
 

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..compute import gpu
-from ..compute.ssim import C1, C2, TAPS, WINDOW
 from ..config import MappingConfig
 from ..render.api import Rendering
+from ..system import gpu
+from ..system.ssim import C1, C2, TAPS, WINDOW
 from . import losses
 from .losses import MAX_GAIN, MIN_PIXELS, NU, OUTLIER, RIDGE, SIZE_LIMIT, SOLID, SSIM_WEIGHT, STRIDE, photo_loss
 from .views import View

@@ -7,13 +7,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ..compute import gpu
-from ..compute.adam import gradients_of
 from ..config import MappingConfig
 from ..render.api import Rendering, in_view, marked_in_view, project_map, render
 from ..render.gaussian_map import GaussianMap
 from ..render.inspection import class_weights
 from ..render.rules import GaussianStats
+from ..system import gpu
+from ..system.adam import gradients_of
 from ..system.parallel import LruSequence
 from ..system.progress import Progress, SilentProgress, is_asked
 from .growth import HIGH_RELIABILITY, LOW_RELIABILITY, SEED_LOGIT, Growth

@@ -239,13 +239,13 @@ def run(context: StageContext) -> dict[str, Any]:
     class_ids = _require_views(context, kept)
     mapped = build_map(context, trajectory, class_ids)
     result, ids = mapped.result, mapped.keyframe_ids
-    MAP.save(context.folder, result.gaussian_map)
-    TRAJECTORY.save(context.folder, mapped.moved)
-    EXPOSURE.save(context.folder, {"frame_ids": ids, "log_gains": result.log_gains, "offsets": result.offsets})
+    context.save(MAP, result.gaussian_map)
+    context.save(TRAJECTORY, mapped.moved)
+    context.save(EXPOSURE, {"frame_ids": ids, "log_gains": result.log_gains, "offsets": result.offsets})
     figures = _figures(mapped)
     rows = [{"own": s.own.tolist(), "border": s.border.tolist(), "beside": list(s.neighbours)} for s in mapped.submaps]
     submaps = rows if len(rows) > 1 else []  # one alone is all of the map
-    FIGURES["mapping"].save(context.folder, {**figures, "class_ids": list(mapped.class_ids), "submaps": submaps})
+    context.save(FIGURES["mapping"], {**figures, "class_ids": list(mapped.class_ids), "submaps": submaps})
     return figures
 
 

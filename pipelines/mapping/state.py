@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...formats.tensors import load_tensors, save_tensors
-from ..compute.adam import AdamTable
 from ..geometry import se3
 from ..render.api import moved, require_all_finite
 from ..render.gaussian_map import GaussianMap
+from ..system.adam import AdamTable
 from .views import View
 
 KEYS = ("means", "log_radii", "opacity_logits", "colors")

@@ -35,12 +35,13 @@ temperature = 0.01                # of the softmax over cosines
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from ...formats.datasets.sequence import read_class_table
 from ...formats.errors import InputError
 from ...formats.reading import parsing
 from ...formats.textfile import read_json, read_toml
+from ..system.values import value_from_json
 
 _MAX_CARD_BYTES = 1 << 20
 _MAX_SIDE = 8192
@@ -132,9 +133,11 @@ def read_card(path: Path) -> Card:
 
 def card_from_values(values: dict[str, Any], path: Path) -> Card:
     """A card from its keys, `model` already a path; `path` is what errors call it. Raises InputError."""
-    known = {f.name: f for f in fields(Card)}
+    kinds = get_type_hints(Card)
     try:
-        card = Card(**{k: _converted(k, v, known[k].type) for k, v in values.items()})
+        if bad := [k for k, v in values.items() if k in _FILES and not isinstance(v, Path)]:
+            raise ValueError(f"{bad[0]} is the name of a file, got {values[bad[0]]!r}")
+        card = Card(**{k: v if k in _FILES else value_from_json(kinds[k], v, k) for k, v in values.items()})
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: {error}") from error
     _check(card, path)
@@ -161,23 +164,6 @@ def _in_folder(path: Path, name: str) -> Path:
         if not target.is_file():
             raise InputError(f"{path}: there is no {name} beside the card. Put it there, or correct the card")
     return target
-
-
-def _converted(key: str, value: Any, kind: Any) -> Any:
-    if key in _FILES:
-        if not isinstance(value, Path):
-            raise ValueError(f"{key} is the name of a file, got {value!r}")
-        return value
-    if str(kind).startswith("tuple"):
-        if not isinstance(value, list):
-            raise ValueError(f"{key} is a list, got {value!r}")
-        if str(kind) == "tuple[str, ...]":
-            return tuple(str(v) for v in value)
-        number = int if "int" in str(kind) else float
-        return tuple(number(v) for v in value)
-    if kind is bool and not isinstance(value, bool):
-        raise ValueError(f"{key} is true or false, got {value!r}")
-    return kind(value)
 
 
 def _check(card: Card, path: Path) -> None:

@@ -14,7 +14,7 @@ from ...formats.atomic import atomic_path
 from ...formats.errors import InputError
 from ...formats.reading import noting_files
 from ...formats.tensors import load_arrays
-from ..providers import Sequence
+from ..geometry.sequence import Sequence
 from ..system.progress import Progress, log
 from ..system.values import load_value, save_value
 from ..types import Frame

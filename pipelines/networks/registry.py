@@ -11,15 +11,16 @@ import shutil
 import tomllib
 import urllib.parse
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ...formats.atomic import atomic_path
 from ...formats.errors import DiskFullError, InputError
-from ...formats.reading import file_sha256, reaching, require_file, user_cache
+from ...formats.reading import file_sha256, parsing, reaching, require_file, user_cache
 from ...formats.textfile import read_json_object, write_json
 from ..system.progress import log
+from ..system.values import dataclass_from_json
 from .card import Card, card_from_values
 
 _TABLE = Path(__file__).with_name("registry.toml")
@@ -39,14 +40,23 @@ class Model:
 
     name: str
     family: str
-    urls: tuple[str, ...]
     bytes: int
     sha256: str
     licence: str
     commercial: bool
+    urls: tuple[str, ...] = ()
     needs: str = ""
     revision: str = ""
     pull: str = ""
+
+
+@dataclass(frozen=True)
+class _Own:
+    """What the user has brought, own.json in the cache: hashes of files that were trusted, by the names of their rows,
+    and models of the user's own."""
+
+    pinned: dict[str, str] = field(default_factory=dict)
+    added: list[Model] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -61,16 +71,12 @@ class ModelStore:
     def open(cache: Path | None = None, table: Path = _TABLE) -> ModelStore:
         """The store of this user. `MSGS_SLAM_CACHE` names another cache folder."""
         values = _parsed(table.read_text(encoding="utf-8"))
-        rows = []
+        store = ModelStore(cache or default_cache(), (), values["family"])
+        own, rows = store._load_own(), []
         for row in values["model"]:
             urls = tuple(url.format(revision=row.get("revision") or "main") for url in row["urls"])
-            rows.append(Model(**{**row, "urls": urls}))
-        store = ModelStore(cache or default_cache(), tuple(rows), values["family"])
-        own = store._load_own()
-        pinned = own["pinned"]
-        rows = [replace(r, sha256=r.sha256 or pinned.get(r.name, "")) for r in rows]
-        added = [store._own_model(row) for row in own["added"]]
-        return replace(store, models=(*added, *rows))
+            rows.append(Model(**{**row, "urls": urls, "sha256": row["sha256"] or own.pinned.get(row["name"], "")}))
+        return replace(store, models=(*own.added, *rows))
 
     def path(self, model: Model) -> Path:
         """Return the path of the model's file, whether it exists or not."""
@@ -84,10 +90,10 @@ class ModelStore:
 
     def get(self, name: str) -> Model:
         """Raises InputError for an unknown name."""
-        for model in self.models:
-            if model.name == name:
-                return model
-        raise InputError(f"there is no model {name!r}; known: {', '.join(m.name for m in self.models)}")
+        found = {model.name: model for model in reversed(self.models)}
+        if name not in found:
+            raise InputError(f"there is no model {name!r}; known: {', '.join(m.name for m in self.models)}")
+        return found[name]
 
     def with_needed(self, names: Sequence[str], best: bool = False) -> list[Model]:
         """The named models and those they work with; without names the small ones, and with `best` the large ones."""
@@ -123,12 +129,8 @@ class ModelStore:
 
     def first_metric(self) -> Model | None:
         """The best network for metric depth in the cache: by itself, or as its training camera saw them."""
-        for model in self.models:
-            family = self.families[model.family]
-            tells = not family.get("relative") or "focal" in family
-            if family["task"] == "depth" and tells and self.is_here(model):
-                return model
-        return None
+        families = {m: self.families[m.family] for m in self.all_here("depth", metres_only=True)}
+        return next((m for m, keys in families.items() if not keys.get("relative") or "focal" in keys), None)
 
     def take(self, folder: Path, models: Sequence[Model]) -> list[Model]:
         """Copy the files of `models` that are in `folder` into the cache; they are known by their content, whatever
@@ -191,8 +193,7 @@ class ModelStore:
             ) from error
         if not model.sha256:
             own = self._load_own()
-            own["pinned"][model.name] = actual
-            self._save_own(own)
+            self._save_own(replace(own, pinned=own.pinned | {model.name: actual}))
         return path
 
     def add(self, file: Path, family: str, name: str = "") -> Model:
@@ -204,9 +205,9 @@ class ModelStore:
         from .session import Network
 
         digest, size = file_sha256(file), file.stat().st_size
-        model = Model(name or file.stem, family, (), size, digest, "the user's own file", False)
+        model = Model(name or file.stem, family, size, digest, "the user's own file", False)
         own = self._load_own()
-        if model.name in {m.name for m in self.models} - {row["name"] for row in own["added"]}:
+        if model.name in {m.name for m in self.models} - {m.name for m in own.added}:
             raise InputError(f"{model.name} is the name of a known model. Give another with --name")
         if not _NAME.fullmatch(model.name):
             raise InputError(f"{model.name!r} is no name for a model: letters, digits, dot, dash and underscore")
@@ -214,52 +215,33 @@ class ModelStore:
         Network(card_from_values(values, _TABLE), 1, "cpu")
         with atomic_path(self.path(model)) as temporary:
             shutil.copyfile(file, temporary)
-        row = {k: getattr(model, k) for k in ("name", "family", "bytes", "sha256", "licence", "commercial")}
-        own["added"] = [r for r in own["added"] if r["name"] != model.name] + [row]
-        self._save_own(own)
+        self._save_own(replace(own, added=[m for m in own.added if m.name != model.name] + [model]))
         return model
 
     def verify(self) -> dict[str, str]:
         """Name → "ok", "not pulled" or what is wrong, for every model."""
-        found = {}
-        for model in self.models:
-            path = self.path(model)
-            if not path.is_file():
-                found[model.name] = "not pulled"
-            elif not model.sha256:
-                found[model.name] = "no known sha256"
-            else:
-                found[model.name] = "ok" if file_sha256(path) == model.sha256 else "damaged: pull it again"
-        return found
+        return {model.name: self._state(model) for model in self.models}
 
-    def _load_own(self) -> dict[str, Any]:
+    def _state(self, model: Model) -> str:
+        if not self.path(model).is_file():
+            return "not pulled"
+        if not model.sha256:
+            return "no known sha256"
+        return "ok" if self._is_whole(model) else "damaged: pull it again"
+
+    def _load_own(self) -> _Own:
         path = self.cache / "own.json"
         with reaching(path):
             if not path.exists():
-                return {"pinned": {}, "added": []}
-        own = read_json_object(path)
-        pinned, added = own.get("pinned"), own.get("added")
-        if not isinstance(pinned, dict) or not all(isinstance(v, str) for v in pinned.values()):
-            pinned = None
-        if pinned is None or not isinstance(added, list):
-            raise InputError(f"{path} is damaged: delete it and add your models again (msgs-slam models add)")
-        return {"pinned": pinned, "added": added}
+                return _Own()
+        with parsing(path, "list of your models", "delete it and add them again (msgs-slam models add)"):
+            own = dataclass_from_json(_Own, read_json_object(path))
+            if bad := [m.name for m in own.added if not _NAME.fullmatch(m.name) or m.family not in self.families]:
+                raise ValueError(f"{bad[0]!r} is no model of a known family")
+            return own
 
-    def _own_model(self, row: Any) -> Model:
-        """A model that the user added, from the list in the cache. Raises InputError where it is not as it was left."""
-        kinds = {"name": str, "family": str, "bytes": int, "sha256": str, "licence": str, "commercial": bool}
-        known = isinstance(row, dict) and row.keys() == kinds.keys()
-        if not known or not all(isinstance(row[k], kind) for k, kind in kinds.items()):
-            raise InputError(f"{self.cache / 'own.json'}: is damaged. Delete it and add your models again")
-        model = Model(**row, urls=())
-        if not _NAME.fullmatch(model.name) or model.family not in self.families:
-            raise InputError(
-                f"{self.cache / 'own.json'}: {model.name!r} is no model of a known family. Delete the file"
-            )
-        return model
-
-    def _save_own(self, own: dict[str, Any]) -> None:
-        write_json(self.cache / "own.json", own)
+    def _save_own(self, own: _Own) -> None:
+        write_json(self.cache / "own.json", asdict(own))
 
 
 @functools.cache
@@ -269,8 +251,8 @@ def _parsed(text: str) -> dict[str, Any]:
 
 def metric_card() -> Card | None:
     """The card of the best network in the cache for metric depth, be it good for nothing else; None without one."""
-    model = ModelStore.open().first_metric()
-    return None if model is None else ModelStore.open().card(model)
+    store = ModelStore.open()
+    return None if (model := store.first_metric()) is None else store.card(model)
 
 
 def missing_networks() -> str | None:
@@ -281,11 +263,9 @@ def missing_networks() -> str | None:
         for what, task in (("class names", "segmentation"), ("metric scale", "depth"), ("person masks", "person"))
         if store.first_here(task, metres_only=True) is None
     ]
-    if not lacks:
-        return None
     size = sum(m.bytes for m in store.with_needed([])) / 1e6
-    named = ", ".join(lacks)
-    return f"Optional networks not installed ({named}; {size:.0f} MB): msgs-slam models pull"
+    named = f"Optional networks not installed ({', '.join(lacks)}; {size:.0f} MB): msgs-slam models pull"
+    return named if lacks else None
 
 
 def _room_classes(count: int) -> dict[str, list[str]]:
@@ -375,7 +355,7 @@ def _fetch_one(url: str, target: Path, size: int, sha256: str, progress: Callabl
 
 
 class _Bar:
-    """Tell how far a download is, and end one that sends more than it should."""
+    """pooch's progress bar: tells how far a download is, and ends one that sends more than it should."""
 
     def __init__(self, size: int, progress: Callable[[int, int], None]) -> None:
         self.size, self.progress, self.total, self.done = size, progress, size, 0

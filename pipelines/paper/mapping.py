@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from ..compute.ssim import ssim_map
 from ..mapping.growth import seed_gaussians, useless
 from ..mapping.losses import size_loss
 from ..mapping.views import View
 from ..render.api import Rendering
+from ..system.ssim import ssim_map
 from ..types import VOID
 from .rendering import Gaussians, semantic_image, show
 from .uncertainty import PAPER, Constants, MirrorPlane, mirror_plane, symmetry_pull

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..compute.adam import AdamTable
 from ..geometry.camera import project_gaussians
 from ..geometry.se3 import transform
 from ..mapping.growth import SEED_LOGIT
@@ -17,6 +16,7 @@ from ..mapping.views import View
 from ..render.api import NEAR, Rendering, depth_ratio, in_view, render
 from ..render.gaussian_map import GaussianMap
 from ..render.rules import ALPHA_MAX, ALPHA_MIN, CUT_SIGMAS
+from ..system.adam import AdamTable
 from ..types import VOID, Intrinsics
 
 

@@ -91,10 +91,10 @@ def track_by_map(context: StageContext) -> dict[str, Any]:
             "for its first frames: give --depth files:FOLDER or a network's name"
         )
     trajectory = trajectory_of(frames, slam.poses, slam.keyframes, slam.lost)
-    TRAJECTORY.save(context.folder, trajectory)
-    MAP.save(context.folder, slam.gaussians.map)
-    SPARSE.save(context.folder, sparse_model(slam.gaussians.map, trajectory, recording.full))
-    DEPTH_FIELDS.save(context.folder, DepthFields(slam.fields))
+    context.save(TRAJECTORY, trajectory)
+    context.save(MAP, slam.gaussians.map)
+    context.save(SPARSE, sparse_model(slam.gaussians.map, trajectory, recording.full))
+    context.save(DEPTH_FIELDS, DepthFields(slam.fields))
     if slam.lost:
         context.warn(f"{len(slam.lost)} frames have no pose: {stretches(slam.lost)}")
     metric = bool(context.run.load(FIGURES["proxy"]).get("metric", False))
@@ -103,7 +103,7 @@ def track_by_map(context: StageContext) -> dict[str, Any]:
         "lost": {str(i): reason for i, reason in slam.lost.items()}, "scale": "metric" if metric else "free",
         "scale_relative_sd": None, "method": "paper", "gaussians": len(slam.gaussians), "pieces": [],
     }  # fmt: skip
-    FIGURES["tracking"].save(context.folder, figures)
+    context.save(FIGURES["tracking"], figures)
     return figures
 
 
@@ -129,15 +129,15 @@ def map_keyframes(context: StageContext) -> dict[str, Any]:
     ids = trajectory.frame_ids[trajectory.is_keyframe].tolist()
     mirror = draw_together(gaussians, scene_unit(recording, ids, fields), context.config.run.seed)
     _visit(context, recording, gaussians, trajectory, fields, MAP_PASSES, "mapping")
-    MAP.save(context.folder, gaussians.map)
-    TRAJECTORY.save(context.folder, trajectory)
+    context.save(MAP, gaussians.map)
+    context.save(TRAJECTORY, trajectory)
     _save_exposure(context, trajectory)
     figures = {
         "keyframes": len(ids), "gaussians": len(gaussians), "submaps": 1,
         "iterations": MAP_PASSES * len(ids), "classes": len(recording.class_ids), "symmetry": mirror.confidence,
         **_measure(recording, gaussians.map, trajectory, fields),
     }  # fmt: skip
-    FIGURES["mapping"].save(context.folder, {**figures, "class_ids": list(recording.class_ids), "submaps": []})
+    context.save(FIGURES["mapping"], {**figures, "class_ids": list(recording.class_ids), "submaps": []})
     return figures
 
 
@@ -184,7 +184,7 @@ def _save_exposure(context: StageContext, trajectory: Trajectory) -> None:
     """The paper has no exposures: none is changed."""
     ids = trajectory.frame_ids[trajectory.is_keyframe]
     nothing = np.zeros((len(ids), 3), np.float32)
-    EXPOSURE.save(context.folder, {"frame_ids": ids, "log_gains": nothing, "offsets": nothing})
+    context.save(EXPOSURE, {"frame_ids": ids, "log_gains": nothing, "offsets": nothing})
 
 
 def close_and_adjust(context: StageContext) -> dict[str, Any]:
@@ -196,17 +196,17 @@ def close_and_adjust(context: StageContext) -> dict[str, Any]:
     if loops:
         trajectory, gaussian_map = _closed(recording, trajectory, fields, gaussian_map, loops)
     gaussians, trajectory, fields = _adjusted(context, recording, trajectory, fields, gaussian_map)
-    TRAJECTORY.save(context.folder, trajectory)
-    SPARSE.save(context.folder, sparse_model(gaussians.map, trajectory, recording.full))
-    MAP.save(context.folder, gaussians.map)
+    context.save(TRAJECTORY, trajectory)
+    context.save(SPARSE, sparse_model(gaussians.map, trajectory, recording.full))
+    context.save(MAP, gaussians.map)
     _save_exposure(context, trajectory)
-    LOOPS.save(context.folder, loops)
-    DEPTH_FIELDS.save(context.folder, fields)
+    context.save(LOOPS, loops)
+    context.save(DEPTH_FIELDS, fields)
     figures = {
         "candidates": tried, "verified": len(loops), "implausible": 0, "unsupported": 0, "loops": len(loops),
         "joint": "kept", **_measure(recording, gaussians.map, trajectory, fields),
     }  # fmt: skip
-    FIGURES["global_ba"].save(context.folder, figures)
+    context.save(FIGURES["global_ba"], figures)
     return figures
 
 

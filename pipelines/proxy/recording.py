@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ...formats.datasets import Dataset
 from ...formats.errors import InputError
-from ..providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider, Sequence, class_colors
+from ..geometry.sequence import Sequence
+from ..providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider, class_colors
 from ..sfm.lens import FramePixels
 from ..system.progress import Progress
 from ..types import VOID, ClassTable, Frame

@@ -16,8 +16,9 @@ from ...formats.errors import InputError
 from ...formats.images import to_grey
 from ..depth.fused import DepthScale
 from ..geometry.camera import unproject
+from ..geometry.sequence import Sequence, resize_area
 from ..labels.segments import SegmentLabels
-from ..providers import MAX_CLASSES, DepthEstimate, DepthProvider, Sequence, resize_area
+from ..providers import MAX_CLASSES, DepthEstimate, DepthProvider
 from ..run.files import BACKBONE, GIVEN_POSES
 from ..run.folder import RunFolder
 from ..run.stages import StageContext

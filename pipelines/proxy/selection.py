@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING, Any
 from ...formats.datasets import Dataset
 from ...formats.errors import InputError, SettingError
 from ..config import Config, ProxyConfig
+from ..geometry.sequence import Sequence
 from ..networks.card import Card, read_card
 from ..networks.network_pass import ResultCache, Workplace
 from ..networks.registry import ModelStore, default_cache, missing_networks
 from ..networks.words import with_words
-from ..providers import MAX_CLASSES, DepthProvider, SemanticsProvider, Sequence
+from ..providers import MAX_CLASSES, DepthProvider, SemanticsProvider
 from ..source.recording import FolderRecording, open_recording
 from ..system.progress import Progress, SilentProgress, log
 from ..types import Calibration, Frame, Intrinsics

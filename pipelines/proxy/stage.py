@@ -57,7 +57,7 @@ class ProxyStage:
         figures = self._figures() | scale_figures(work.depths, scale, reference) | moving
         self._warn_of_focal(figures.get("network_focal_px"))
         self._warn_of_guesses(figures["reliable_pixels"])
-        FIGURES["proxy"].save(self.context.folder, figures)
+        self.context.save(FIGURES["proxy"], figures)
         return figures
 
     def _frames_to_do(self) -> list[Frame]:
@@ -109,20 +109,19 @@ class ProxyStage:
 
     def _compute_maps(self, scale: DepthScale, reference: ReferenceScale | None) -> None:
         """Compute labels and the stored maps of every frame, in metres where there is a `reference`."""
-        folder, semantics = self.context.folder, self.work.semantics
+        context, semantics = self.context, self.work.semantics
         in_frames(self.work, precompute_labels, self.frames)
         semantics.fit(self.frames, lambda frame: scale.in_backbone_unit(self.work.depth(frame)))
         for message in semantics.warnings():
             self.warn(message)
-        CLASSES.save(folder, semantics.classes())
+        context.save(CLASSES, semantics.classes())
         metres = reference.factor if reference else 1.0
         made = in_frames(self.work, make_maps, self.frames, scale=scale, metres=metres, semantics=dump_state(semantics))
         if descriptors := {i: descriptor for part in made for i, descriptor in part.items()}:
-            DESCRIPTORS.save(folder, descriptors)
+            context.save(DESCRIPTORS, descriptors)
         scales = scale.of_frame.items()
-        FRAME_SCALES.save(
-            folder, [{"frame_id": i, "scale": round(s, 6), "spread": round(scale.spread_in[i], 6)} for i, s in scales]
-        )
+        rows = [{"frame_id": i, "scale": round(s, 6), "spread": round(scale.spread_in[i], 6)} for i, s in scales]
+        context.save(FRAME_SCALES, rows)
 
     def _warn_of_focal(self, network_focal: float | None) -> None:
         """Warn where the depth network sees quite another focal length than the calibration has."""
@@ -157,7 +156,7 @@ class ProxyStage:
         full = self.work.sequence.calibration.intrinsics
         for k, moved in found.items():
             shown = cv2.resize(moved.astype(np.float32), (full.width, full.height), interpolation=cv2.INTER_LINEAR)
-            LEFT_OUT.save(self.context.folder, shown > 0.5, posed[k].name)
+            self.context.save(LEFT_OUT, shown > 0.5, posed[k].name)
         share = round(float(np.mean([m.mean() for m in found.values()])), 4) if found else 0.0
         return {"moving_frames": len(found), "moving_share": share} if found else {}
 

@@ -11,20 +11,12 @@ from numpy.typing import NDArray
 
 from ..depth.fused import DepthScale
 from ..geometry.camera import resample_nearest
+from ..geometry.sequence import Sequence, resize_area
 from ..geometry.voxels import to_lab
 from ..masks.moving import SIDE, MovingView, find_moving_once
-from ..providers import (
-    DepthEstimate,
-    DepthProvider,
-    LabelEstimate,
-    SemanticsProvider,
-    Sequence,
-    load_state,
-    resize_area,
-)
+from ..providers import DepthEstimate, DepthProvider, LabelEstimate, SemanticsProvider, load_state
 from ..run.files import BACKBONE, CALIBRATION, FRAMES, LEFT_OUT, PROXY_MAPS
-from ..run.stages import StageContext
-from ..run.tasks import Chunk, in_chunks
+from ..run.stages import Chunk, StageContext, in_chunks
 from ..source.recording import open_recording
 from ..system.parallel import map_lookahead
 from ..system.progress import Progress
@@ -70,7 +62,7 @@ class ProxyWork:
     def depth(self, frame: Frame) -> DepthEstimate:
         """Unknown where something moved, once that has been looked for."""
         found = self.computed_depth(frame)
-        moved = LEFT_OUT.find(self.context.folder, frame.name)
+        moved = self.context.find(LEFT_OUT, frame.name)
         if moved is None:
             return found
         height, width = found.depth.shape
@@ -117,7 +109,7 @@ def load_sequence(context: StageContext) -> Sequence:
 
     def left_out(frame: Frame) -> NDArray[np.bool_] | None:
         """Return the pixels that any earlier step masks out."""
-        return any_of((run.find(LEFT_OUT, of=frame.name), LEFT_OUT.find(context.folder, frame.name)))
+        return any_of((run.find(LEFT_OUT, of=frame.name), context.find(LEFT_OUT, frame.name)))
 
     return Sequence(run.load(FRAMES), calibration, camera, run.find(BACKBONE), run.image, left_out)
 
@@ -176,7 +168,7 @@ def make_maps(task: Chunk, progress: Progress) -> dict[int, NDArray[np.float32]]
             u = reliability(depth.depth, depth.confidence)
             scaled = (depth.depth * metres).astype(np.float32)
             maps = compact(ProxyMaps(scaled, u, labels.labels, labels.confidence))
-            PROXY_MAPS.save(work.context.folder, maps, frame.id)
+            work.context.save(PROXY_MAPS, maps, frame.id)
         return frame.id, labels.descriptor
 
     made = map_lookahead(make, frames[task.first : task.last], work.context.threads)

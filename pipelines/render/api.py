@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..compute import gpu
-from ..compute.threads import PART, for_each, fused_kernel
 from ..geometry import se3
 from ..geometry.camera import project_gaussians
+from ..system import gpu
 from ..system.machine import has_triton
+from ..system.threads import PART, for_each, fused_kernel
 from ..types import Intrinsics
 from . import rules
 from .rules import GaussianStats

@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..compute.lanes import add_to_box, load, maximum, reduce_max, splat, store, total, where
-from ..compute.threads import as_array, fused_kernel, inlined, inner
+from ..system.lanes import add_to_box, load, maximum, reduce_max, splat, store, total, where
+from ..system.threads import as_array, fused_kernel, inlined, inner
 from .cpu_backward import pull_back
 from .cpu_bands import (
     PIXELS,

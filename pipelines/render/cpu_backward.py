@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compute.lanes import add_totals, load, maximum, reciprocal, reduce_max, splat, store, total, where
-from ..compute.threads import PART, for_each, fused_kernel, inlined, inner
+from ..system.lanes import add_totals, load, maximum, reciprocal, reduce_max, splat, store, total, where
+from ..system.threads import PART, for_each, fused_kernel, inlined, inner
 from . import rules
 from .cpu_bands import (
     PIXELS,

@@ -12,8 +12,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compute.lanes import any_lane, iota, lane_exp, load, maximum, min_scalar, splat, store, where
-from ..compute.threads import PART, for_each, fused_kernel, inner
+from ..system.lanes import any_lane, iota, lane_exp, load, maximum, min_scalar, splat, store, where
+from ..system.threads import PART, for_each, fused_kernel, inner
 from . import rules
 
 F32 = np.float32

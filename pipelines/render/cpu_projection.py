@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..compute.threads import PART, as_array, for_each, fused_kernel, inner
+from ..system.threads import PART, as_array, for_each, fused_kernel, inner
 from ..types import Intrinsics
 
 

@@ -10,7 +10,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ..compute import gpu
+from ..system import gpu
 from . import rules
 from .cuda_kernels import backward_tile, divide_back_pixels, divide_pixels, forward_tile, inspect_tile
 from .cuda_projection import project, record

@@ -11,7 +11,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ..compute import gpu
+from ..system import gpu
 from ..types import Intrinsics
 from . import rules
 

@@ -1,4 +1,4 @@
-"""Tasks on the nodes of a Ray cluster.
+"""Tasks in other processes: one after the other on this machine, or side by side on the nodes of a Ray cluster.
 
 What is given to a task and what it returns goes through Ray; what it reads of the run and leaves there are files on a
 disk that all nodes have under the same path. A task leaves each file whole or not at all, and one that ran half or
@@ -6,8 +6,13 @@ twice leaves the same: so Ray may begin it again where its process or its node i
 """
 
 import functools
+import multiprocessing
+import os
 import platform
+import signal
 import socket
+import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,13 +21,15 @@ from typing import Any, TypeVar
 from ...formats.atomic import unique_temp_names
 from ...formats.errors import InputError, RecoverableError, install_extra
 from ..system.identity import package_digest
-from ..system.progress import Progress, SilentProgress, stop_if_asked
-from .tasks import limit_threads
+from ..system.progress import Progress, SilentProgress, Stopped, is_asked, log, soft_stop, stop_if_asked
+from ..system.threads import limit_threads
 
 T = TypeVar("T")
 R = TypeVar("R")
 RETRIES = 3
 """How often Ray begins a task again whose process or node is lost."""
+_STARTS = 2
+"""How often a process of this machine is started when it is lost."""
 _ANSWERS_WITHIN, _ENDS_WITHIN = 5.0, 20.0
 """Seconds: for an address to answer, for cancelled tasks to end by themselves."""
 _COMPUTE = ("torch", "numpy", "scipy", "pycolmap", "numba", "opencv-python-headless", "scikit-image")
@@ -180,3 +187,62 @@ def _require_answer(address: str) -> None:
             f"no Ray answers at {address} ({error}). Start one there with `ray start --head`, mind the firewall, or "
             "omit --address to use this machine alone"
         ) from error
+
+
+def run_in_processes(
+    work: Callable[[T, Progress], object], tasks: Sequence[T]
+) -> Iterator[tuple[int, Callable[[], None]]]:
+    """Call `work`, a function of a module's top level, on each task in a process of its own, one after the other.
+
+    Yields the number of each task as its process ends, and what raises RecoverableError where that was lost twice
+    (killed, out of memory). The first signal to stop is passed on to the process; one whose parent is gone stops.
+    """
+    for number, task in enumerate(tasks):
+        for _ in range(_STARTS):
+            stop_if_asked()
+            code = _run_process(work, task)
+            stop_if_asked()
+            if code >= 0:
+                break
+            log.warning("task %d: its process was lost (%s)", number + 1, signal.Signals(-code).name)
+        yield number, functools.partial(_require_ended, code)
+
+
+def _require_ended(code: int) -> None:
+    if code:
+        memory = ", for want of memory perhaps" if code == -signal.SIGKILL else ""
+        how = f"ended by {signal.Signals(-code).name}{memory}" if code < 0 else f"exit code {code}"
+        raise RecoverableError(f"its process was lost: {how}")
+
+
+def _run_process(work: Callable[[T, Progress], object], task: T) -> int:
+    """The exit code of the process, negative where a signal ended it."""
+    process = multiprocessing.get_context("spawn").Process(target=_in_child, args=(work, task), daemon=True)
+    process.start()
+    is_passed_on = False
+    try:
+        while process.exitcode is None:
+            process.join(0.2)
+            if is_asked() and not is_passed_on:
+                process.terminate()
+                is_passed_on = True
+        return process.exitcode
+    finally:
+        process.kill()
+        process.join()
+
+
+def _in_child(work: Callable[[T, Progress], object], task: T) -> None:
+    os.setsid()  # a terminal's Ctrl-C goes to all processes of a session, and the parent passes on what it means
+    threading.Thread(target=_stop_with_parent, daemon=True).start()
+    try:
+        with soft_stop(lambda number: None):
+            work(task, SilentProgress())
+    except Stopped as stopped:
+        sys.exit(128 + stopped.number)
+
+
+def _stop_with_parent() -> None:
+    if (parent := multiprocessing.parent_process()) is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)

@@ -24,10 +24,10 @@ from ...formats.reading import file_sha256, parsing
 from ...formats.textfile import MAX_OWN_JSON_BYTES, read_json_object, write_json
 from ..config import STAGES
 from ..system.progress import log
+from ..system.values import dataclass_from_json
 from .folder import RunFolder
-from .manifest import StageRecord, content_digest
-from .reads import LOGS, Situation
-from .schema import dataclass_from_json
+from .manifest import content_digest
+from .reads import LOGS, Situation, StageRecord
 from .target import LIST
 
 SNAPSHOT, RECORD = "snapshot", ".record.json"

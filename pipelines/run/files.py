@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ...formats.atomic import write_text
 from ...formats.reading import is_plain_name
 from ..geometry.sparse_model import FrameObservations, SparseModel
+from ..system.values import dataclass_from_json
 from ..types import (
     VOID,
     Calibration,
@@ -30,7 +31,7 @@ from ..types import (
     Trajectory,
     Vocabulary,
 )
-from .schema import RunFile, dataclass_from_json, require_increasing, require_indices, require_rigid
+from .schema import RunFile, require_increasing, require_indices, require_rigid
 
 if TYPE_CHECKING:
     from ..depth.fields import DepthFields
@@ -264,7 +265,7 @@ DEPTH_FIELDS: RunFile[DepthFields] = RunFile(
 )  # fmt: skip
 """The fields that bring proxy depths into the world of a stage."""
 
-EXPOSURE: RunFile[dict[str, NDArray]] = RunFile(
+EXPOSURE: RunFile[dict[str, Any]] = RunFile(
     "exposure.npz", ("mapping", "global_ba"), "table of exposures", dict, dict,
     {"frame_ids": "i N", "log_gains": "f N 3", "offsets": "f N 3"},
 )  # fmt: skip

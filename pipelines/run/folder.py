@@ -10,6 +10,8 @@
 into the folder of the running stage (`RunFile.save`). The table of the files is `run/files.py`.
 """
 
+from __future__ import annotations
+
 import os
 from dataclasses import dataclass, field, fields, replace
 from itertools import count, takewhile
@@ -25,14 +27,14 @@ from ...formats.images import read_rgb
 from ...formats.reading import file_sha256, require_no_link, resolve_own
 from ...formats.textfile import read_toml
 from ..config import EXTENSION, SOURCE_LIST, Config
-from ..read_config import UnknownSettingError, config_to_toml, merge_known_settings
 from ..system.progress import log
 from ..system.wording import quoted
 from ..types import Frame, ProxyMaps, any_of
 from .files import LEFT_OUT, PROXY_MAPS, SPARSE
-from .manifest import Manifest, Source, StageRecord, previous_settings, read_manifest, recorded_config
-from .reads import digest_of_result, note_result
+from .manifest import Manifest, Source, previous_settings, read_manifest, recorded_config
+from .reads import StageRecord, digest_of_result, note_result
 from .schema import RunFile
+from .settings import UnknownSettingError, config_to_toml, merge_known_settings
 
 T = TypeVar("T")
 Stamp = tuple[int, int, int]
@@ -59,6 +61,22 @@ class RunFolder:
         """The folder's whole path, which has a name: "." has none."""
         return Path(os.path.abspath(self.root))
 
+    def required(self) -> RunFolder:
+        """Return the run itself. Raises InputError where the folder holds none."""
+        if self.manifest_file.exists():
+            return self
+        what = "does not exist" if not self.root.exists() else "is not a run folder (it has no manifest.json)"
+        near = f"; did you mean {' or '.join(map(str, found))}?" if (found := self._near()) else "."
+        raise InputError(f"{self.root} {what}{near} Runs are made by `msgs-slam reconstruct VIDEO`")
+
+    def _near(self, limit: int = 3) -> list[Path]:
+        """Runs that may be meant where this is none: in it, around it, of the video that it is, of a like name."""
+        path = self.root
+        inside = sorted(path.iterdir()) if path.is_dir() else []
+        named = [path.with_suffix(".msgs"), Path(f"{path.stem}.msgs")] if path.name else []  # "." and "/" have no name
+        places = dict.fromkeys([*inside, *named, *path.parents[:2]])
+        return [p for p in places if RunFolder(p).manifest_file.is_file()][:limit]
+
     def path(self, *names: str) -> Path:
         """Return the path of a file or folder of the run, there or not. Raises InputError for one that would lie
         outside of it, by its name or by a link: the run may be anybody's."""
@@ -72,7 +90,7 @@ class RunFolder:
         """Folder of an unfinished stage. Raises as `path`."""
         return self.path(f"{name}.partial")
 
-    def piece(self, name: str) -> "RunFolder":
+    def piece(self, name: str) -> RunFolder:
         """Return the run inside this one that a disconnected component is. Raises as `path`."""
         return RunFolder(self.path(name))
 
@@ -104,6 +122,81 @@ class RunFolder:
             self._manifest[stamp] = manifest
         return self._manifest[stamp]
 
+    @property
+    def records(self) -> dict[str, StageRecord]:
+        """The finished stages by name."""
+        manifest = self.manifest()
+        return {} if manifest is None else dict(manifest.records)
+
+    @property
+    def stale(self) -> dict[str, StageRecord]:
+        """The stages whose results are of before a stage ahead of them was made again, by name."""
+        manifest = self.manifest()
+        return {} if manifest is None else dict(manifest.stale)
+
+    @property
+    def source(self) -> Source:
+        """The source that the run is made from. Raises InputError for a folder that is not a run."""
+        source = (self.manifest() or read_manifest(self.manifest_file)).source
+        path = Path(source.path)
+        if path.name != SOURCE_LIST:
+            return source
+        # The list of several videos is in the run, wherever that has been moved to.
+        place = (path.parent.name, SOURCE_LIST) if path.parent.name.startswith(EXTENSION) else (SOURCE_LIST,)
+        return replace(source, path=str(found)) if (found := self.path(*place)).is_file() else source
+
+    def why_not_done(self, stage: str) -> str:
+        """Say that a stage is not done, and how to come to its results: of one whose results are stale also the
+        settings with which they count again."""
+        resume = f"msgs-slam resume {quoted(self.root)}"
+        if stage not in (stale := self.stale):
+            return f"{stage} is not done. Run `{resume}` first"
+        changed = previous_settings(stale[stage], self.settings())
+        back = f", or go back with `{resume} {' '.join(f'--set {quoted(t)}' for t in changed)}`" if changed else ""
+        return (
+            f"{stage} is not done: what is in {self.stage(stage)} was made before the run was changed, and does not "
+            f"belong to what it holds now. Run `{resume}` to make it again{back}"
+        )
+
+    def save_settings(self, config: Config) -> None:
+        """Write run.toml, atomically, where it holds other settings. Raises InputError when the disk refuses."""
+        if not self.settings_file.exists() or self.settings() != config:
+            write_text(self.settings_file, _FIRST_LINE + config_to_toml(config) + _LAST_LINE)
+
+    def settings(self) -> Config:
+        """Load the settings with which the run goes on; the file may have been edited.
+
+        Where it is gone, what the finished stages were made with is taken, and defaults for the others. Raises
+        InputError where none is finished, for a file that is cut short, and for values that a setting cannot have.
+        """
+        file = self.settings_file
+        if not file.exists():
+            if not (records := self.records):
+                raise InputError(
+                    f"{self.root} was stopped before its settings were written, or {file.name} is gone, and nothing "
+                    f"is finished: run `msgs-slam reconstruct {quoted(self.source.path)} --out {quoted(self.root)}` "
+                    "with the options it had"
+                )
+            log.warning("%s is gone: stages that are not done get default settings", file)
+            return recorded_config(records, Config())
+        try:
+            require_no_link(file)
+            values = read_toml(file)
+            is_complete = all(f.name in values.get(name, {}) for name, s in vars(Config()).items() for f in fields(s))
+            if not is_complete and _LAST_LINE.encode().strip() not in file.read_bytes():
+                raise InputError(f"{file} is cut short, for its last line is missing ({_LAST_LINE.strip()})")
+            config, dropped = merge_known_settings(Config(), values, str(file))
+            if wrong := next((error for error in dropped if not isinstance(error, UnknownSettingError)), None):
+                raise wrong
+        except InputError as error:
+            raise InputError(
+                f"{error}. Correct it, or delete it and run `msgs-slam resume {quoted(self.root)}`: what the finished "
+                "stages were made with is kept in manifest.json"
+            ) from error
+        for unknown in dropped:  # of another version of the program, or mistyped
+            log.warning("%s: it is ignored", unknown)
+        return config
+
     def has(self, stage: str, name: str) -> bool:
         """Whether the finished stage has left a file of that name, be it there still or not."""
         manifest = self.manifest()
@@ -125,7 +218,7 @@ class RunFolder:
         if manifest is None:
             return path
         if stage not in manifest.records:
-            raise InputError(f"{self.root}: {why_not_done(self, stage)}")
+            raise InputError(f"{self.root}: {self.why_not_done(stage)}")
         note_result(self.root, stage, name, lambda: digest_of_result(manifest.records[stage], name))
         expected = manifest.records[stage].files.get(name)
         if expected is None or not self._is_intact(stage, name, *expected):
@@ -138,8 +231,7 @@ class RunFolder:
     def damaged(self, stage: str) -> list[str]:
         """Names of the files of a finished stage, or a stale one, that are gone or not as it left them. Reads all of
         them. Those of the pieces, runs inside the run, count for the export, which makes them."""
-        manifest = self.manifest()
-        ended = {**manifest.stale, **manifest.records} if manifest else {}
+        ended = {**self.stale, **self.records}
         files = ended[stage].files if stage in ended else {}
         own = [name for name, expected in files.items() if not self._is_intact(stage, name, *expected)]
         names = {name.partition("/")[0] for name in files if stage == "export" and name.startswith("piece_")}
@@ -205,85 +297,3 @@ class RunFolder:
 def _place(file: RunFile[T], stage: str, of: int | str, piece: str) -> tuple[str, str]:
     """The stage, and the file's name in its folder."""
     return stage or file.stages[0], str(PurePosixPath(piece, file.name.format(of)))
-
-
-def load_records(run: RunFolder) -> dict[str, StageRecord]:
-    """The finished stages by name."""
-    manifest = run.manifest()
-    return {} if manifest is None else dict(manifest.records)
-
-
-def load_stale(run: RunFolder) -> dict[str, StageRecord]:
-    """Load the stages whose results are of before a stage ahead of them was made again, by name."""
-    manifest = run.manifest()
-    return {} if manifest is None else dict(manifest.stale)
-
-
-def why_not_done(run: RunFolder, stage: str) -> str:
-    """Say that a stage is not done, and how to come to its results: of one whose results are stale also the settings
-    with which they count again."""
-    manifest, resume = run.manifest(), f"msgs-slam resume {quoted(run.root)}"
-    stale = manifest.stale if manifest is not None else {}
-    if stage not in stale:
-        return f"{stage} is not done. Run `{resume}` first"
-    changed = previous_settings(stale[stage], load_settings(run))
-    back = f", or go back with `{resume} {' '.join(f'--set {quoted(text)}' for text in changed)}`" if changed else ""
-    return (
-        f"{stage} is not done: what is in {run.stage(stage)} was made before the run was changed, and does not belong "
-        f"to what it holds now. Run `{resume}` to make it again{back}"
-    )
-
-
-def load_source(run: RunFolder) -> Source:
-    """Load the source of a run. Raises InputError for a folder that is not a run."""
-    manifest = run.manifest()
-    source = read_manifest(run.manifest_file).source if manifest is None else manifest.source
-    path = Path(source.path)
-    if path.name != SOURCE_LIST:
-        return source
-    # The list of several videos is in the run, wherever that has been moved to.
-    place = (path.parent.name, SOURCE_LIST) if path.parent.name.startswith(EXTENSION) else (SOURCE_LIST,)
-    return replace(source, path=str(found)) if (found := run.path(*place)).is_file() else source
-
-
-def save_settings(run: RunFolder, config: Config) -> None:
-    """Write run.toml, atomically, where it holds other settings. Raises InputError when the disk refuses."""
-    text = _FIRST_LINE + config_to_toml(config) + _LAST_LINE
-    if not run.settings_file.exists() or load_settings(run) != config:
-        write_text(run.settings_file, text)
-
-
-def load_settings(run: RunFolder) -> Config:
-    """Load the settings with which the run goes on; the file may have been edited.
-
-    Where it is gone, what the finished stages were made with is taken, and defaults for the others. Raises InputError
-    where none is finished, for a file that is cut short, and for values that a setting cannot have.
-    """
-    file = run.settings_file
-    if not file.exists():
-        if not (records := load_records(run)):
-            raise InputError(
-                f"{run.root} was stopped before its settings were written, or {file.name} is gone, and "
-                f"nothing is finished: run `msgs-slam reconstruct {quoted(load_source(run).path)} "
-                f"--out {quoted(run.root)}` with the options it had"
-            )
-        log.warning("%s is gone: stages that are not done get default settings", file)
-        return recorded_config(records, Config())
-    try:
-        require_no_link(file)
-        values = read_toml(file)
-        is_complete = all(f.name in values.get(name, {}) for name, s in vars(Config()).items() for f in fields(s))
-        if not is_complete and _LAST_LINE.encode().strip() not in file.read_bytes():
-            raise InputError(f"{file} is cut short, for its last line is missing ({_LAST_LINE.strip()})")
-        config, dropped = merge_known_settings(Config(), values, str(file))
-        for error in dropped:
-            if not isinstance(error, UnknownSettingError):
-                raise error
-    except InputError as error:
-        raise InputError(
-            f"{error}. Correct it, or delete it and run `msgs-slam resume {quoted(run.root)}`: what the finished "
-            "stages were made with is kept in manifest.json"
-        ) from error
-    for unknown in dropped:  # of another version of the program, or mistyped
-        log.warning("%s: it is ignored", unknown)
-    return config

@@ -15,7 +15,7 @@ from typing import IO
 from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 
 from ...formats.errors import InputError, RecoverableError
-from .folder import RunFolder, load_records
+from .folder import RunFolder
 
 LOCK, SOFT_LOCK = ".lock", ".lock.owner"
 """The second on disks without locks: whichever process can make it works on the run."""
@@ -45,7 +45,7 @@ def locked(run: RunFolder) -> Iterator[None]:
     except Exception as error:
         unusable = isinstance(error, InputError) and not isinstance(error, RecoverableError)
         begun = run.manifest_file.exists()
-        if made and (not begun or (unusable and not load_records(run))):
+        if made and (not begun or (unusable and not run.records)):
             shutil.rmtree(run.root, ignore_errors=True)
         raise
     finally:

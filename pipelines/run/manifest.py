@@ -12,10 +12,10 @@ from ...formats.errors import InputError
 from ...formats.reading import is_plain_path, parsing
 from ...formats.textfile import MAX_OWN_JSON_BYTES, read_json_object, write_json
 from ..config import STAGES, Config, config_to_dict
-from ..read_config import merge_known_settings
+from ..system.values import dataclass_from_json
 from ..system.wording import quoted
-from .reads import Reads
-from .schema import dataclass_from_json
+from .reads import StageRecord
+from .settings import merge_known_settings
 
 FORMAT = 3
 """Of manifest.json."""
@@ -27,22 +27,6 @@ class Source:
 
     path: str
     digest: str
-
-
-@dataclass(frozen=True)
-class StageRecord:
-    """One finished stage. reads: what it was made from; files: relative path → [bytes, sha256]; settings: {"run": ...,
-    its own section: ...}, those that it was made with, whatever run.toml says by now; of a stale one the sections of
-    the other stages, too."""
-
-    reads: Reads
-    files: dict[str, tuple[int, str]]
-    seconds: float
-    peak_memory_mb: float
-    figures: dict[str, Any]
-    warnings: list[str]
-    content: str
-    settings: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

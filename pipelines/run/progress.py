@@ -13,9 +13,9 @@ from typing import TypeVar
 from ...formats.errors import InputError
 from ...formats.textfile import read_json
 from ..system.progress import BEGUN, Progress, StageEvent, about
+from ..system.values import dataclass_from_json
 from .folder import RunFolder
 from .lock import is_locked
-from .schema import dataclass_from_json
 
 T = TypeVar("T")
 PROGRESS = ".progress.json"

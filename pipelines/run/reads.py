@@ -16,13 +16,14 @@ import functools
 import hashlib
 import json
 import os
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from threading import Lock
-from typing import IO, TYPE_CHECKING, Any, Generic, TypeVar
+from typing import IO, Any, TypeVar
 
 from ...formats.atomic import process_token
 from ...formats.errors import InputError
@@ -30,9 +31,6 @@ from ...formats.reading import known_sha256, noting_files, on_each_read
 from ..config import EXTENSION, Config
 from ..system.identity import ROOMS, ROOT
 from ..system.progress import Progress
-
-if TYPE_CHECKING:
-    from .manifest import StageRecord
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -57,8 +55,7 @@ class Reads:
 
     def changed_settings(self, config: Config) -> list[str]:
         """Return `section.key=value` of each setting that `config` has otherwise."""
-        now = {key: _setting(config, key) for key in self.settings}
-        return [f"{key}={now[key]}" for key, value in self.settings.items() if now[key] != value]
+        return [f"{key}={now}" for key, value in self.settings.items() if (now := _setting(config, key)) != value]
 
     def difference(self, now: Situation) -> str:
         """Say what of it is another by now, "" where nothing is. A file that is gone is no other one."""
@@ -69,7 +66,8 @@ class Reads:
         if self.source != now.source:
             return "it is of another source"
         for stage, (digest, names) in self.results.items():
-            if stage not in now.records or _digest_of_results(now.records[stage], names) != digest:
+            record = now.records.get(stage)
+            if record is None or _digest_of_pairs((n, digest_of_result(record, n)) for n in names) != digest:
                 return f"{stage} has other results by now"
         other = [path for path, digest in self.files.items() if _digest_of_path(Path(path)) not in (digest, "")]
         return f"{other[0]} is another file by now" if other else ""
@@ -77,6 +75,22 @@ class Reads:
     def gone(self) -> list[str]:
         """Return the files that were there and are no longer."""
         return [path for path, digest in self.files.items() if digest and not os.path.exists(path)]
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """One finished stage. reads: what it was made from; files: relative path → [bytes, sha256]; settings: {"run": ...,
+    its own section: ...}, those that it was made with, whatever run.toml says by now; of a stale one the sections of
+    the other stages, too."""
+
+    reads: Reads
+    files: dict[str, tuple[int, str]]
+    seconds: float
+    peak_memory_mb: float
+    figures: dict[str, Any]
+    warnings: list[str]
+    content: str
+    settings: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -110,10 +124,6 @@ def digest_of_result(record: StageRecord, name: str) -> str:
     return record.files[name][1] if name in record.files else ""
 
 
-def _digest_of_results(record: StageRecord, names: Iterable[str]) -> str:
-    return _digest_of_pairs((name, digest_of_result(record, name)) for name in names)
-
-
 def _digest_of_pairs(pairs: Iterable[tuple[str, str]]) -> str:
     return hashlib.sha256(json.dumps([*pairs]).encode()).hexdigest()
 
@@ -126,7 +136,7 @@ class ReadLog:
         self._root, self._folder = root.absolute(), folder
         self.config = replace(config, **{f.name: _plain(getattr(config, f.name)) for f in fields(config)})
         self._seen = set(_entries(folder)) if (folder / LOGS).is_dir() else set()
-        self._covered: set[str] = set()
+        self.covered: set[str] = set()
         self._lock = Lock()
         self._stream: IO[str] | None = None
 
@@ -158,7 +168,7 @@ class ReadLog:
     def note_file(self, path: Path) -> None:
         """Note a file or folder of the user or a network; the package's own, the source's and the run's are known."""
         text = os.path.abspath(path)
-        if ("files", text) in self._seen or text in self._covered:
+        if ("files", text) in self._seen or text in self.covered:
             return
         if any(Path(text).resolve().is_relative_to(ROOT / room) for room in ROOMS):
             return
@@ -166,32 +176,17 @@ class ReadLog:
         if not inside or inside[0].startswith(EXTENSION):
             self.note("files", text, lambda: _digest_of_path(Path(text)))
 
-    def cover(self, files: Iterable[Path]) -> None:
-        """These files are part of something that is known by a digest of its own."""
-        self._covered.update(os.path.abspath(file) for file in files)
-
-    def for_task(self, work: Callable[[T, Progress], R]) -> NotedTask[T, R]:
+    def for_task(self, work: Callable[[T, Progress], R]) -> Callable[[T, Progress], R]:
         """Return the work so that it notes what it reads in the process that does it."""
-        return NotedTask(work, self._root, self._folder, self.config)
+        noted = functools.partial(_work_noted, work, self._root, self._folder, self.config)
+        return functools.update_wrapper(noted, work)
 
 
-@dataclass(frozen=True)
-class NotedTask(Generic[T, R]):
-    """Work of a stage that runs in another process."""
-
-    work: Callable[[T, Progress], R]
-    root: Path
-    folder: Path
-    config: Config
-
-    @property
-    def __name__(self) -> str:
-        return getattr(self.work, "__name__", "tasks")
-
-    def __call__(self, task: T, progress: Progress) -> R:
-        """Do a task."""
-        with ReadLog(self.root, self.folder, self.config):
-            return self.work(task, progress)
+def _work_noted(
+    work: Callable[[T, Progress], R], root: Path, folder: Path, config: Config, task: T, progress: Progress
+) -> R:
+    with ReadLog(root, folder, config):
+        return work(task, progress)
 
 
 def active_log() -> ReadLog | None:
@@ -214,7 +209,7 @@ def note_figures(root: Path, records: Mapping[str, StageRecord]) -> None:
 def cover_files(files: Iterable[Path]) -> None:
     """Tell the stage that this thread works for that its source's digest covers these files."""
     if (log := _active.get()) is not None:
-        log.cover(files)
+        log.covered.update(os.path.abspath(file) for file in files)
 
 
 def _entries(folder: Path) -> dict[tuple[str, str], Any]:
@@ -237,19 +232,15 @@ def begin_log(folder: Path, now: Situation) -> None:
 
 def reads_in(folder: Path) -> Reads:
     """Return what the processes that have worked in a folder have read."""
-    of: dict[str, dict[str, Any]] = {kind: {} for kind in ("program", "source", "settings", "results", "files")}
-    for (kind, key), value in _entries(folder).items():
-        of.setdefault(kind, {})[key] = value
-    names: dict[str, list[str]] = {}
-    for place in sorted(of["results"]):
+    of: defaultdict[str, dict[str, Any]] = defaultdict(dict)
+    for (kind, key), value in sorted(_entries(folder).items(), key=lambda entry: entry[0]):
+        of[kind][key] = value
+    read_of: defaultdict[str, dict[str, str]] = defaultdict(dict)
+    for place, digest in of["results"].items():
         stage, _, name = place.partition("/")
-        names.setdefault(stage, []).append(name)
-    results = {
-        stage: (_digest_of_pairs((n, of["results"][f"{stage}/{n}"]) for n in inside), inside)
-        for stage, inside in names.items()
-    }
-    settings, files = dict(sorted(of["settings"].items())), dict(sorted(of["files"].items()))
-    return Reads(of["program"].get("", ""), of["source"].get("", ""), settings, results, files)
+        read_of[stage][name] = digest
+    results = {stage: (_digest_of_pairs(found.items()), list(found)) for stage, found in read_of.items()}
+    return Reads(of["program"].get("", ""), of["source"].get("", ""), of["settings"], results, of["files"])
 
 
 def watched(config: Config) -> Config:

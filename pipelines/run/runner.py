@@ -12,65 +12,46 @@ from pathlib import Path
 from ...formats.atomic import is_disk_full, remove_temporaries
 from ...formats.errors import DiskFullError, InputError, RecoverableError
 from ...formats.reading import links_in
-from ..config import STAGES, Config
+from ..config import STAGES
 from ..system.machine import release_free_memory
 from ..system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log, stop_if_asked
 from ..system.wording import quoted
 from .ending import empty, find_sealed, move_in, results, seal, unseal
-from .folder import RunFolder, load_records, load_stale, save_settings
-from .manifest import (
-    Manifest,
-    Source,
-    StageRecord,
-    content_digest,
-    finite_or_none,
-    recorded_config,
-    settings_of,
-    write_manifest,
-)
+from .folder import RunFolder
+from .manifest import Manifest, Source, content_digest, finite_or_none, recorded_config, settings_of, write_manifest
 from .progress import TimeLeft
-from .reads import ReadLog, Situation, begin_log, reads_in, watched
-from .stages import SameSource, Stage, StageContext, TaskWorkers, stopping_after_writes, trust_source
-from .tasks import limit_threads
+from .reads import ReadLog, Situation, StageRecord, begin_log, reads_in, watched
+from .stages import Stage, StageContext, stopping_after_writes
 
 _PROCESS = Path("/proc/self")
 
 
 def run_stages(
-    stages: list[Stage],
-    run: RunFolder,
-    source: Path,
-    source_digest: str,
-    config: Config,
-    progress: Progress,
-    until: str = STAGES[-1],
-    same_source: SameSource = trust_source,
-    workers: TaskWorkers | None = None,
-    threads: int = 0,
-    redo: str = "",
+    work: StageContext, digest: str, until: str = STAGES[-1], threads: int = 0, redo: str = ""
 ) -> dict[str, StageRecord]:
-    """Bring every stage up to `until` up to date; returns their records.
+    """Bring every stage of `work` up to `until` up to date; returns their records.
 
-    `config` is what was asked for, and is saved; the stages work with so many `threads` where it leaves that open. The
-    stage `redo` and those after it are made again in any case, and `auto` chooses anew for them.
+    Its settings are what was asked for, and are saved; the stages work with so many `threads` where these leave that
+    open. `digest` is that of its source. The stage `redo` and those after it are made again in any case, and `auto`
+    chooses anew for them.
 
     A stage is up to date when its files are unchanged and all that it has read is (`run/reads.py`). Nothing of the run
     changes before everything that can be checked is; then the settings are written, and the manifest calls a stage that
     has to run again stale, with those after it, before it starts. Their folders stay until their own new results are
     ready; what still fits then counts again. Raises InputError as the stages do.
     """
-    run = RunFolder(run.root.absolute())  # tasks take it to processes with another working folder
-    book = _Records(run, Source(str(source), source_digest))
+    work = replace(work, run=RunFolder(work.run.root.absolute()))  # processes with another working folder get it
+    run, config, wanted = work.run, work.config, work.stages[: STAGES.index(until) + 1]
+    book = _Records(run, Source(str(work.source), digest))
     records = book.current
-    wanted = stages[: STAGES.index(until) + 1]
-    _check(wanted, run, source, config, source_digest, same_source, redo)
+    _check(work, wanted, digest, redo)
     if run.manifest() is None:
         book.save()
-    save_settings(run, config)
+    run.save_settings(config)
     settled = replace(config, run=replace(config.run, threads=config.run.threads or threads))
-    reporter = StageReporter(progress, wanted, records, settled.run.threads)
+    reporter = StageReporter(work.progress, wanted, records, settled.run.threads)
     for stage in wanted:
-        record, now = book.find(stage.name), Situation(stage.program, source_digest, config, records)
+        record, now = book.find(stage.name), Situation(stage.program, digest, config, records)
         why = "" if record is None else rerun_reason(stage, run, record, now)
         why = why or ("as asked for" if stage.name == redo else "")
         if record is None or why:
@@ -78,20 +59,18 @@ def run_stages(
                 log.warning("%s and what follows are made again (%s)", stage.name, why)
             begun = stage.name not in records
             book.set_aside(stage.name, keep=stage.name != redo)
-            folder = run.partial(stage.name)
-            context = StageContext(run, source, watched(settled), folder, progress, [], stages, same_source, workers)
+            context = replace(work, config=watched(settled), folder=run.partial(stage.name), warnings=[])
             with reporter.running(stage.name) as ended:
                 sealed = _find_ended(stage, run, now) if begun else None
                 record = sealed or _run_one(stage, context, now)
                 move_in(run, stage.name)
                 ended(record)
             book.enter(stage.name, record)
-            unseal(run, stage.name)
         else:
             if stage.name not in records:
                 book.enter(stage.name, record)
-            unseal(run, stage.name)
             reporter.report(stage.name, UP_TO_DATE)
+        unseal(run, stage.name)
     return records
 
 
@@ -116,7 +95,7 @@ class _Records:
 
     def __init__(self, run: RunFolder, origin: Source) -> None:
         self._run, self._origin = run, origin
-        self.current, self._stale = load_records(run), load_stale(run)
+        self.current, self._stale = run.records, run.stale
 
     def save(self) -> None:
         """Write the manifest."""
@@ -164,6 +143,8 @@ class StageReporter:
     @contextmanager
     def running(self, name: str) -> Iterator[Callable[[StageRecord], None]]:
         """The stage runs in this block, which hands its record over at its end."""
+        from ..system.threads import limit_threads  # imports torch
+
         limit_threads(self._threads)
         self._left.begin(name)
         self.report(name, BEGUN)
@@ -179,15 +160,14 @@ class StageReporter:
             raise
 
 
-def _check(
-    stages: list[Stage], run: RunFolder, source: Path, config: Config, digest: str, same_source: SameSource, redo: str
-) -> None:
+def _check(work: StageContext, wanted: Sequence[Stage], digest: str, redo: str) -> None:
     """Raise InputError where a stage has work to do and could not. A finished one whose inputs are gone (files deleted,
     a network removed) stays as it is."""
-    for stage in stages:
+    run, config = work.run, work.config
+    for stage in wanted:
         run.partial(stage.name)  # refuses a link
-    checks, records, settled = [], {**load_stale(run), **load_records(run)}, True
-    for stage in stages:
+    checks, records, settled = [], {**run.stale, **run.records}, True
+    for stage in wanted:
         record = records.get(stage.name)
         now = Situation(stage.program, digest, config, records)
         if settled and record and stage.name != redo and not rerun_reason(stage, run, record, now):
@@ -195,14 +175,14 @@ def _check(
                 log.warning("%s: keeps what it was made from (%s is gone)", stage.name, path)
             continue
         settled = False
-        if stage is stages[0]:
-            same_source()
+        if stage is wanted[0]:
+            work.same_source()
         if stage.check_settings:
             stage.check_settings(config)
         if stage.check:
             checks.append(stage.check)
     for check in checks:  # these open networks and read files, which takes longer than what is refused above
-        check(source, config)
+        check(work.source, config)
 
 
 def _find_ended(stage: Stage, run: RunFolder, now: Situation) -> StageRecord | None:

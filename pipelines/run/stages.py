@@ -1,11 +1,13 @@
-"""Stages of a run: what each is, and everything that it is given."""
+"""Stages of a run: what each is, everything that it is given, and the tasks into which it divides its work: ranges of
+keyframes, pairs or regions, done here or on the nodes of a cluster."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -17,10 +19,13 @@ from ..system.progress import Progress, log, stop_if_asked
 from .ending import SNAPSHOT
 from .folder import RunFolder
 from .reads import active_log
+from .schema import RunFile
 
 T = TypeVar("T")
 R = TypeVar("R")
 SameSource = Callable[[], None]
+_CHUNKS_PER_WORKER = 3
+"""Tasks a worker, so that all end at about the same time."""
 
 
 def trust_source() -> None:
@@ -49,11 +54,11 @@ class TaskWorkers(Protocol):
 class StageContext:
     """Everything that a stage is given.
 
-    `folder` is the stage's own unfinished folder: it writes its result there, and may keep snapshots under
-    `folder / "snapshot"`, which is removed when the stage ends well. What an interrupted attempt with the same
-    settings and inputs has left in `folder` is still there when the stage starts again. `stages` are all of the run;
-    `same_source` raises RecoverableError where the source is not, or no longer, what the run was begun from; `workers`
-    take the tasks that a stage is divided into, None for this process.
+    `folder` is the stage's own unfinished folder, into which `save` writes its results; `snapshot` inside it is removed
+    when the stage ends well. What an interrupted attempt with the same settings and inputs has left there is still
+    there when the stage starts again. `stages` are all of the run; `same_source` raises RecoverableError where the
+    source is not, or no longer, what the run was begun from; `workers` take the tasks that a stage is divided into,
+    None for this process.
     """
 
     run: RunFolder
@@ -88,18 +93,21 @@ class StageContext:
         """Device of dense work, "cpu" or "cuda"."""
         return resolve_device(self.config.run.device)
 
+    def save(self, file: RunFile[T], value: T, of: int | str = "", piece: str = "") -> Path:
+        """Leave a file of the run's table, `of` which frame, in the folder of which `piece`; returns its path."""
+        return file.save(self.folder / piece, value, of)
+
+    def find(self, file: RunFile[T], of: int | str = "") -> T | None:
+        """Read a file that the stage has left already, None where it has not."""
+        return file.find(self.folder, of)
+
     def each(self, work: Callable[[T, Progress], R], tasks: Sequence[T]) -> list[R]:
         """Do `work`, a function of a module's top level, on every task, here, one after the other, or by the workers;
         returns its results in order. A task leaves files below `folder`, and does nothing where they are."""
         if self.workers is None:
-            return [self._done(work, task) for task in tasks]
+            return [_done(work, task, self.progress) for task in tasks]
         log = active_log()
         return self.workers.each(work if log is None else log.for_task(work), tasks, self.folder, self.progress)
-
-    def _done(self, work: Callable[[T, Progress], R], task: T) -> R:
-        result = work(task, self.progress)
-        release_free_memory()
-        return result
 
     def warn(self, message: str) -> None:
         """A degraded result: logged now, counted and kept for the report."""
@@ -107,10 +115,54 @@ class StageContext:
         self.warnings.append(message)
 
 
+def _done(work: Callable[[T, Progress], R], task: T, progress: Progress) -> R:
+    result = work(task, progress)
+    release_free_memory()
+    return result
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """The things first to last - 1 (keyframes, blocks of pairs, regions of a mesh), in a stage's unfinished `folder`;
+    `known` holds what is known of all of them, and `opened` is what the stage has open already where its own process
+    does the task."""
+
+    run: RunFolder
+    source: Path
+    config: Config
+    folder: Path
+    known: dict[str, Any]
+    first: int
+    last: int
+    opened: Any = None
+
+    @property
+    def numbers(self) -> range:
+        """Numbers of the things."""
+        return range(self.first, self.last)
+
+    def context(self, progress: Progress) -> StageContext:
+        """Return the stage's context; a task hands out none itself."""
+        return StageContext(self.run, self.source, self.config, self.folder, progress)
+
+
+def in_chunks(
+    context: StageContext, work: Callable[[Chunk, Progress], R], count: int, opened: Any = None, **known: Any
+) -> list[R]:
+    """Do `work` on ranges of `count` things, with what is `known` of all; returns its results in order.
+
+    This process takes all of them as one range; the workers of a cluster get several each.
+    """
+    wanted, here = (_CHUNKS_PER_WORKER * context.workers.at_once, None) if context.workers else (1, opened)
+    parts = max(min(wanted, count), 1)
+    ends = [count * n // parts for n in range(parts + 1)]
+    task = Chunk(context.run, context.source, context.config, context.folder, known, 0, 0, here)
+    return context.each(work, [replace(task, first=a, last=b) for a, b in pairwise(ends)])
+
+
 @dataclass(frozen=True)
 class Later:
-    """A function of a module below pipelines/ that is imported when it is called: who only asks for a run's state does
-    not wait for torch and COLMAP."""
+    """A function of a module below pipelines/ that is imported when it is called, so that `status` starts fast."""
 
     module: str
     name: str = "run"

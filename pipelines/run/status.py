@@ -6,10 +6,9 @@ from typing import Any
 
 from ..config import STAGES, Config
 from ..system.wording import quoted
-from .folder import RunFolder, load_records, load_settings, load_source, load_stale, why_not_done
-from .manifest import StageRecord
+from .folder import RunFolder
 from .progress import RunProgress, load_run_progress
-from .reads import Situation
+from .reads import Situation, StageRecord
 from .runner import rerun_reason
 from .stages import Stage
 
@@ -75,7 +74,7 @@ class RunStatus:
     @property
     def notes(self) -> list[str]:
         """Remarks on the run that are no fault."""
-        older = [f"older results are kept: {why_not_done(self.run, name)}" for name in list(load_stale(self.run))[:1]]
+        older = [f"older results are kept: {self.run.why_not_done(name)}" for name in list(self.run.stale)[:1]]
         gone = [f"{path} (read by {s.name})" for s in self.stages if s.record for path in s.record.reads.gone()]
         return older + ([f"files that were read are gone, the results are kept: {', '.join(gone)}"] if gone else [])
 
@@ -103,7 +102,7 @@ def run_status(run: RunFolder, program: Program = lambda method: ()) -> RunStatu
 
     Raises InputError where the manifest or the settings are damaged.
     """
-    records, config = load_records(run), load_settings(run)
+    records, config = run.records, run.settings()
     again, running = _made_again(run, program(config.run.method), records, config), load_run_progress(run)
     stages = []
     for name in STAGES:
@@ -114,14 +113,14 @@ def run_status(run: RunFolder, program: Program = lambda method: ()) -> RunStatu
         now = running if running and running.stage == name and record is None else None
         state = RUNNING if now else _state(run, name, record, damaged)
         stages.append(StageStatus(name, state, record, changed, damaged, why, now))
-    return RunStatus(run, load_source(run).path, tuple(stages))
+    return RunStatus(run, run.source.path, tuple(stages))
 
 
 def _made_again(
     run: RunFolder, program: Sequence[Stage], records: dict[str, StageRecord], config: Config
 ) -> dict[str, str]:
     """The first stage that would be made again, and why."""
-    source = load_source(run).digest
+    source = run.source.digest
     for stage in program:
         if (record := records.get(stage.name)) is None:
             break

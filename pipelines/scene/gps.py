@@ -14,8 +14,7 @@ from ...formats.errors import InputError
 from ...formats.gps import Track, enu_from_geodetic, photo_places, read_track
 from ..config import GPS_AUTO, GPS_OFF
 from ..geometry.se3 import Similarity
-from ..outcome import Outcome
-from ..run.folder import load_source
+from ..run.outcome import Outcome
 from ..source.recording import FolderRecording, open_recording
 from ..system.progress import log
 from .world import Georeference, World
@@ -67,7 +66,7 @@ def _laid_out(outcome: Outcome, world: World, places: Array) -> World | str:
 def _exif_places(outcome: Outcome) -> Array:
     none = np.full((len(outcome.frames), 3), np.nan)
     try:
-        source = open_recording(Path(load_source(outcome.run).path), outcome.config.run.format)
+        source = open_recording(Path(outcome.run.source.path), outcome.config.run.format)
     except InputError:
         return none  # moved away since: its contribution is lost, and nothing else
     if not isinstance(source, FolderRecording):

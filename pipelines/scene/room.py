@@ -22,9 +22,9 @@ from ..geometry.room_layout import (
     name_structure,
 )
 from ..geometry.room_layout import SURFACE as UNNAMED
+from ..geometry.sequence import resize_area
 from ..geometry.voxels import MIN_WEIGHT, VOXELS_PER_DEPTH, Voxels, find, gather_frame, merge, voxel_keys
 from ..labels.named import disputed
-from ..providers import resize_area
 from ..types import VOID, Array, Intrinsics, ProxyMaps
 from . import evidence
 from .evidence import Evidence, Mode, Sizes, measured

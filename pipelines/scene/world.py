@@ -13,15 +13,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compute.threads import get_threads, host_threads
 from ..geometry.posed_depth import PosedDepth
 from ..geometry.room_layout import Gravity, find_gravity, floor_plane, name_structure
 from ..geometry.se3 import Similarity
 from ..geometry.voxels import VOXELS_PER_DEPTH, Voxels, gather_depths
 from ..mapping.measure import depth_view
-from ..outcome import Outcome, maps_around, spread_sample
-from ..run.schema import RunFile, dataclass_from_json
+from ..run.outcome import Outcome, maps_around, spread_sample
+from ..run.schema import RunFile
 from ..system.parallel import map_lookahead, parallel_map
+from ..system.threads import get_threads, host_threads
+from ..system.values import dataclass_from_json
 from ..types import Array, Intrinsics
 
 SAME = Similarity(1.0, np.eye(3), np.zeros(3))

@@ -17,7 +17,7 @@ from ...formats.trajectory import write_tum
 from ...formats.video import probe_video
 from ..config import EXTENSION, SOURCE_LIST, STAGES, Config
 from ..run.files import CALIBRATION, TRAJECTORY
-from ..run.folder import RunFolder, load_records, load_source
+from ..run.folder import RunFolder
 from ..run.manifest import Manifest, Source, write_manifest
 from ..system.wording import quoted
 from .files import require_different, video_files
@@ -42,14 +42,14 @@ def is_extension(source: Path) -> bool:
 
 def is_added(run: RunFolder, videos: Sequence[Path]) -> bool:
     """Return whether the run's last extension, finished or not, was by exactly these videos."""
-    source, added = Path(load_source(run).path), [video.resolve() for video in videos]
+    source, added = Path(run.source.path), [video.resolve() for video in videos]
     return is_extension(source) and list(video_files(source))[-len(added) :] == added
 
 
 def require_extendable(run: RunFolder, videos: Sequence[Path], config: Config) -> None:
     """Raise InputError where the run cannot be extended by these videos; nothing is written."""
-    source = Path(load_source(run).path)
-    done, needed = load_records(run), STAGES[: STAGES.index(_FINAL) + 1]
+    source = Path(run.source.path)
+    done, needed = run.records, STAGES[: STAGES.index(_FINAL) + 1]
     unfinished = [s for s in needed if s not in done or run.damaged(s)]
     made = {
         "with --poses": bool(config.frames.poses),
@@ -82,7 +82,7 @@ def require_extendable(run: RunFolder, videos: Sequence[Path], config: Config) -
 
 def add_videos(run: RunFolder, videos: Sequence[Path], config: Config) -> Source:
     """Make the run one of all its videos and these, with none of its stages done; one write of the manifest decides."""
-    files = [file.resolve() for file in video_files(Path(load_source(run).path))]
+    files = [file.resolve() for file in video_files(Path(run.source.path))]
     earlier = sorted(run.root.glob(f"{EXTENSION}*"))
     numbers = [int(n) for p in earlier if (n := p.name.removeprefix(EXTENSION)).isdigit()]
     path = run.path(f"{EXTENSION}{max(numbers, default=0) + 1}", SOURCE_LIST)

@@ -1,12 +1,13 @@
-"""Values as files, for going on after an interruption: dataclasses of this program, arrays and plain values."""
+"""Values as files, for going on after an interruption: dataclasses of this program, arrays and plain values; and
+dataclasses from the plain values of JSON and TOML."""
 
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from ...formats.reading import parsing
 from ...formats.tensors import load_arrays, save_arrays
 
+T = TypeVar("T")
 _TREE = "tree"
 _OURS = "msgs_slam.pipelines."
 
@@ -107,3 +109,45 @@ def _value(tree: Any, arrays: Mapping[str, NDArray]) -> Any:
     if kind == "dict":
         return {_value(k, arrays): _value(v, arrays) for k, v in content}
     return _of_name(kind)(**{name: _value(v, arrays) for name, v in content.items()})
+
+
+def dataclass_from_json(cls: type[T], value: Any) -> T:
+    """A dataclass of plain fields from its `asdict` after JSON; what has a default may be missing. Raises ValueError
+    for other keys or types."""
+    types, known = get_type_hints(cls), fields(cls)  # type: ignore[arg-type]
+    names = [f.name for f in known]
+    needed = {f.name for f in known if f.default is MISSING and f.default_factory is MISSING}
+    if not isinstance(value, dict) or not needed <= set(value) <= set(names):
+        found = sorted(map(str, value)) if isinstance(value, dict) else type(value).__name__
+        raise ValueError(f"{cls.__name__}: expected {', '.join(names)}, got {found}")
+    return cls(**{name: value_from_json(types[name], value[name], f"{cls.__name__}.{name}") for name in value})
+
+
+def value_from_json(wanted: Any, value: Any, name: str) -> Any:
+    """Check a plain value against an annotation, and make that type of it. Raises ValueError, which names it `name`."""
+    if isinstance(wanted, type) and is_dataclass(wanted):
+        return dataclass_from_json(wanted, value)
+    if wanted in (int, float, str, bool):
+        fits = isinstance(value, int | float) if wanted is float else isinstance(value, wanted)
+        if not fits or (isinstance(value, bool) and wanted is not bool):
+            raise ValueError(f"{name} is {str(value)[:40]!r}, expected {wanted.__name__}")
+        return wanted(value)
+    kind, inside = get_origin(wanted), get_args(wanted)
+    if wanted is Any or kind in (dict, list) or (kind is tuple and float not in inside):
+        return _nested(kind, inside, value, name)
+    array = np.asarray(value, np.float64)  # what is left are rows and matrices of numbers
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} holds numbers that are not finite")
+    return array if "ndarray" in str(wanted).lower() else tuple(array.tolist())
+
+
+def _nested(kind: Any, inside: tuple[Any, ...], value: Any, name: str) -> Any:
+    """A dict, a list or a tuple, each value of its own type, or anything at all."""
+    if kind is None:
+        return value
+    if kind is dict and isinstance(value, dict):
+        return {str(k): value_from_json(inside[1], v, f"{name}.{k}") for k, v in value.items()}
+    if kind is dict or not isinstance(value, list):
+        raise ValueError(f"{name} is {str(value)[:40]!r}")
+    types = inside if kind is tuple and inside[-1] is not ... else inside[:1] * len(value)
+    return kind(value_from_json(t, v, name) for t, v in zip(types, value, strict=True))

@@ -1,23 +1,11 @@
-"""Figures, numbers of frames and findings in few words."""
+"""Figures and numbers of frames in few words."""
 
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 MAX_STRETCHES = 8
-GOOD, NOTE, BAD = "ok", "note", "BAD"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line of an examination; `fix` says what to type or change, "" where nothing needs to be."""
-
-    name: str
-    state: str
-    text: str
-    fix: str = ""
 
 
 def quoted(path: Path | str) -> str:

@@ -81,7 +81,7 @@ class TrackingStage:
         figures = {**self._figures(state, report), **carried, "pieces": [len(p.poses) for p in pieces]}
         if "reference_relative_sd" in self.proxy:  # what the user's reference leaves open; depths agree far better
             figures["scale_relative_sd"] = self.proxy["reference_relative_sd"]
-        FIGURES["tracking"].save(self.context.folder, figures)
+        self.context.save(FIGURES["tracking"], figures)
         self._warn_of_lost(state, pieces)
         return figures
 
@@ -131,20 +131,19 @@ class TrackingStage:
     def _save_pieces(self, pieces: list[TrackState]) -> None:
         """Write the disconnected components, each in a world and a unit of its own."""
         for number, piece in enumerate(pieces, 2):
-            folder = self.context.folder / f"piece_{number}"
-            TRAJECTORY.save(folder, to_trajectory(piece, self.frames))
-            SPARSE.save(folder, sparse_model_of(piece))
+            self.context.save(TRAJECTORY, to_trajectory(piece, self.frames), piece=f"piece_{number}")
+            self.context.save(SPARSE, sparse_model_of(piece), piece=f"piece_{number}")
             self.context.warn(
                 f"{len(piece.poses)} frames ({stretches(sorted(piece.poses))}) form a disconnected component: they are "
                 f"exported separately, as piece_{number}"
             )
 
     def _save(self, state: TrackState, report: Report) -> None:
-        folder, model = self.context.folder, sparse_model_of(state)
-        TRAJECTORY.save(folder, to_trajectory(state, self.frames))
-        SPARSE.save(folder, model)
-        FRAME_OBSERVATIONS.save(folder, to_frame_observations(state))
-        DEPTH_FIELDS.save(folder, align_depths(model, report, self.pictures.intrinsics, self.pictures.proxy))
+        context, model = self.context, sparse_model_of(state)
+        context.save(TRAJECTORY, to_trajectory(state, self.frames))
+        context.save(SPARSE, model)
+        context.save(FRAME_OBSERVATIONS, to_frame_observations(state))
+        context.save(DEPTH_FIELDS, align_depths(model, report, self.pictures.intrinsics, self.pictures.proxy))
 
     def _figures(self, state: TrackState, report: Report) -> dict[str, Any]:
         world = report.ties.world

@@ -25,12 +25,12 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.textfile import read_json_object, write_json
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
-from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.read_config import config_to_toml, load_config
 from msgs_slam.pipelines.reconstruct import all_stages, reconstruct
-from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings, load_source, save_settings
-from msgs_slam.pipelines.run.manifest import Manifest, StageRecord, write_manifest
-from msgs_slam.pipelines.run.reads import Reads
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.manifest import Manifest, write_manifest
+from msgs_slam.pipelines.run.outcome import load_outcome
+from msgs_slam.pipelines.run.reads import Reads, StageRecord
+from msgs_slam.pipelines.run.settings import config_to_toml, load_config
 from msgs_slam.pipelines.run.stages import Stage
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress
 
@@ -152,7 +152,7 @@ def _bring_up_to_date(source: Path, job: Job, first: Job, progress: Progress) ->
 def _measure(job: Job, truth: Dataset, progress: Progress, max_views: int) -> None:
     """Write the figures of a run beside it, unless they are those of what it holds now."""
     file = _figures_file(job)
-    stamp = {name: record.content for name, record in load_records(job.run).items()} | {"views": max_views}
+    stamp = {name: record.content for name, record in job.run.records.items()} | {"views": max_views}
     if file.exists() and read_json_object(file).get("stamp") == stamp:
         return
     write_json(file, {"stamp": stamp, "figures": evaluate_outcome(load_outcome(job.run), truth, progress, max_views)})
@@ -265,15 +265,15 @@ def branch(
     unfinished = RunFolder(target.root.with_name(target.root.name + ".partial"))
     shutil.rmtree(unfinished.root, ignore_errors=True)
     unfinished.root.mkdir(parents=True)
-    source, records = load_source(origin), load_records(origin)
+    source, records = origin.source, origin.records
     taken = {name: records[name] for name in names if name in records}
     for name in taken:
         shutil.copytree(origin.stage(name), unfinished.stage(name), copy_function=_link)
-    config = load_settings(origin)
+    config = origin.settings()
     if accept is not None:
         taken, config = _accepted(taken, *accept, source.digest), accept[1]
     write_manifest(unfinished.manifest_file, Manifest(source, taken))
-    save_settings(unfinished, config)
+    unfinished.save_settings(config)
     os.replace(unfinished.root, target.root)
 
 

@@ -26,12 +26,12 @@ sys.path.insert(0, str(ROOT))
 from shape import gather, make_view, measure, true_depths
 
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
-from msgs_slam.pipelines.providers import Sequence
+from msgs_slam.pipelines.geometry.sequence import Sequence
 from msgs_slam.pipelines.proxy.maps import reliability
 from msgs_slam.pipelines.proxy.selection import STEREO_PLANES
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 DEPTH = Path("pipelines/depth")

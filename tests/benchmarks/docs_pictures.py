@@ -25,8 +25,8 @@ from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.evaluation.report import write_report
 from msgs_slam.pipelines.evaluation.write import CLIP, VIDEO
 from msgs_slam.pipelines.export.stage import export_run
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from tests.benchmarks.first_picture import first_picture
 from tests.browser import Page, browser
 from tests.world import ClipOptions, World, iter_clip, make_world, render_view

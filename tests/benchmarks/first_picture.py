@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.evaluation.views import label_picture, render_outcome
-from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.scene.world import WORLD
 from tests.benchmarks.textured_mesh import Textured
 

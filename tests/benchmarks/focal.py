@@ -164,10 +164,10 @@ def recorded(name: str, work: Path) -> tuple[Input, AdjustedModel | None]:
     from poses import recordings
     from tracking import COARSE, original_names, prepare
 
-    from msgs_slam.pipelines.read_config import load_config
     from msgs_slam.pipelines.reconstruct import reconstruct
     from msgs_slam.pipelines.run.files import FRAMES
     from msgs_slam.pipelines.run.folder import RunFolder
+    from msgs_slam.pipelines.run.settings import load_config
     from msgs_slam.pipelines.sfm.driver import StructureFromMotion
 
     form, widths = RECORDINGS[name]

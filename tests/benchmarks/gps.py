@@ -19,8 +19,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from msgs_slam.formats.gps import enu_from_geodetic, photo_places
-from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run.folder import RunFolder, load_source
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.scene.gps import georeference
 from msgs_slam.pipelines.scene.world import WORLD
 from msgs_slam.pipelines.source.recording import FolderRecording, open_recording
@@ -98,7 +98,7 @@ def main() -> None:
     outcome, world = load_outcome(run), run.find(WORLD)
     if world is None or world.earth is None:
         sys.exit(f"{run.root}: its export has no place on the Earth")
-    source = open_recording(Path(load_source(run).path), outcome.config.run.format)
+    source = open_recording(Path(run.source.path), outcome.config.run.format)
     assert isinstance(source, FolderRecording)
     posed = outcome.trajectory.is_posed
     frames = [f for f, has in zip(outcome.frames, posed, strict=True) if has]

@@ -36,9 +36,9 @@ from msgs_slam.formats.reading import file_sha256
 from msgs_slam.formats.textfile import read_json_object, write_json
 from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.config import STAGES, Config
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct, resume
-from msgs_slam.pipelines.run.folder import RunFolder, load_settings
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.system.identity import package_digest
 from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.world import ClipOptions, iter_clip, make_world
@@ -178,7 +178,7 @@ class Killer:
     def go_on(self, config: Config) -> Any:
         """As `msgs-slam resume`: from the settings in run.toml, where they are those of this round."""
         run = RunFolder(self.run.root)
-        own = run.settings_file.exists() and load_settings(run) == config
+        own = run.settings_file.exists() and run.settings() == config
         return resume(run, SilentProgress(), None if own else config)
 
     def first_moments(self, config: Config) -> None:

@@ -34,7 +34,6 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_flatten
 
-from msgs_slam.pipelines.compute import gpu
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.depth.stereo import cuda as stereo_cuda
 from msgs_slam.pipelines.depth.stereo.matching import StereoImages
@@ -44,6 +43,7 @@ from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View, make_view
 from msgs_slam.pipelines.render import api, cuda, inspection
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
+from msgs_slam.pipelines.system import gpu
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
 from tests import pretend_device
 from tests.pretend_device import DEVICE, PretendTensor

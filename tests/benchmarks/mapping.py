@@ -30,10 +30,10 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
-from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
-from msgs_slam.pipelines.run.folder import RunFolder, load_records
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.benchmarks.ablate import ABLATIONS as ARTICLE_ABLATIONS
 
@@ -120,7 +120,7 @@ def measure_case(case: Case, name: str, data: Path, work: Path, overrides: list[
     started = time.monotonic()
     reconstruct(recording / case.source, run, load_config(None, settings), SilentProgress())
     yield "seconds", time.monotonic() - started
-    records = load_records(run)
+    records = run.records
     for stage in ("mapping", "global_ba", "export"):
         yield f"{stage} seconds", records[stage].seconds
         yield from _numbers(records[stage].figures, stage)

@@ -36,7 +36,7 @@ from msgs_slam.pipelines.evaluation.metrics import DepthErrorSum, psnr, ssim
 from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.mapping.optimise import optimise_map
 from msgs_slam.pipelines.mapping.views import View, make_view, occurring_classes, without_contradicted_depth
-from msgs_slam.pipelines.read_config import load_config
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.system.parallel import LruSequence
 from msgs_slam.pipelines.types import VOID, Intrinsics, ProxyMaps
 

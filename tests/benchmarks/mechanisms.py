@@ -30,8 +30,8 @@ from msgs_slam.formats.colmap import pose_of
 from msgs_slam.pipelines.frames import tasks
 from msgs_slam.pipelines.frames.stage import FramesStage
 from msgs_slam.pipelines.geometry.camera import ONE_CAMERA
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.sfm import candidates
 from msgs_slam.pipelines.sfm import driver as sfm

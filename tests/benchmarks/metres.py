@@ -23,10 +23,11 @@ import numpy as np
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.trajectory import read_matrices
 from msgs_slam.pipelines.geometry.se3 import align_points
+from msgs_slam.pipelines.geometry.sequence import Sequence
 from msgs_slam.pipelines.labels.learned import OnnxLabels
 from msgs_slam.pipelines.networks.network_pass import ResultCache, Workplace
 from msgs_slam.pipelines.networks.registry import ModelStore
-from msgs_slam.pipelines.providers import DepthEstimate, Sequence
+from msgs_slam.pipelines.providers import DepthEstimate
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, PROXY_MAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.evidence import Evidence, combine

@@ -41,13 +41,13 @@ from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.evaluation.views import Picture, label_picture, render_outcome
 from msgs_slam.pipelines.geometry.camera import resample_nearest, unproject_depth
 from msgs_slam.pipelines.networks.session import Network
-from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.providers import class_colors
 from msgs_slam.pipelines.proxy.selection import choose_semantics
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.scene.world import FIRST, WORLD
 from msgs_slam.pipelines.sfm.lens import FramePixels
 from msgs_slam.pipelines.types import VOID, ClassTable

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.errors import InputError
-from msgs_slam.msgs_cli.doctor import print_findings
+from msgs_slam.msgs_cli.doctor import BAD, GOOD, NOTE, Finding, print_findings
 from msgs_slam.pipelines.evaluation.write import unpack_demo_clip
 from msgs_slam.pipelines.geometry.voxels import normals_in_cam
 from msgs_slam.pipelines.networks.card import Card, read_card
@@ -26,7 +26,6 @@ from msgs_slam.pipelines.networks.outputs import network_depth, network_probabil
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.networks.runtime import is_tflite
 from msgs_slam.pipelines.networks.session import Letterbox, Network
-from msgs_slam.pipelines.system.wording import BAD, GOOD, NOTE, Finding
 from msgs_slam.pipelines.types import Intrinsics
 
 _PLAIN, _IMAGENET, _HALVES = ((0.0,) * 3, (1.0,) * 3), ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)), ((0.5,) * 3,) * 2
@@ -60,6 +59,10 @@ class KnownView:
     names: tuple[str, ...]
 
 
+def named(name: str, state: str, text: str, fix: str = "") -> Finding:
+    return Finding(state, text, fix, name)
+
+
 def check_network(card: Card, view: KnownView, threads: int = 1) -> list[Finding]:
     """Open the network of a card and compare its input, outputs, sizes, units and ranges with what the card says.
 
@@ -72,7 +75,7 @@ def check_network(card: Card, view: KnownView, threads: int = 1) -> list[Finding
         if all(f.state != BAD for f in found):
             found += {"depth": _depth, "segmentation": _segmentation, "person": _person}[card.task](network, view)
     except InputError as error:
-        return [Finding("contract", BAD, str(error), "correct the card, or name the family that the file is of")]
+        return [named("contract", BAD, str(error), "correct the card, or name the family that the file is of")]
     return found
 
 
@@ -82,7 +85,7 @@ def _input(network: Network, view: KnownView) -> Finding:
     height, width = box.box_height, box.box_width
     text = f"{network.card.input}, {width}x{height}"
     if is_tflite(network.card.model):  # their sides are the file's own, and 8 bits hide a change at the rim
-        return Finding("input", GOOD, text)
+        return named("input", GOOD, text)
     whole = Letterbox(width, height, width, height)
     fitted = Letterbox(view.camera.width, view.camera.height, width, height)
     image = fitted.put(view.image, np.full(3, 127, np.float32)).astype(np.uint8)
@@ -92,12 +95,12 @@ def _input(network: Network, view: KnownView) -> Finding:
         changed[rim] = np.where(image[rim] > 127, 0, 255)
         if np.array_equal(network.run(changed, whole)["output"], right, equal_nan=True):
             fix = "give `multiple` in the card: 14 for DINOv2 and MoGe, 28 for Metric3D"
-            return Finding("input", BAD, f"{text}: the last {side} has no influence on the answer", fix)
+            return named("input", BAD, f"{text}: the last {side} has no influence on the answer", fix)
     short = [f"{g}" for g, w in zip(right.shape[-2:], (height, width), strict=True) if 0 < abs(g - w) < w / 20]
     if network.card.kind in ("", "plane") and short:
         fix = "sides that are multiples of 28 come back whole: `multiple = 28`, or `size`"
-        return Finding("input", NOTE, f"{text}: comes back with {' and '.join(short)} px and is stretched", fix)
-    return Finding("input", GOOD, text)
+        return named("input", NOTE, f"{text}: comes back with {' and '.join(short)} px and is stretched", fix)
+    return named("input", GOOD, text)
 
 
 def _range(network: Network, view: KnownView) -> list[Finding]:
@@ -119,10 +122,10 @@ def _range(network: Network, view: KnownView) -> list[Finding]:
     if errors[own] > _GOOD_ERROR and errors[best] < _BETTER * errors[own]:
         itself = "; the network seems to normalise its input itself" if best.startswith("0..255") else ""
         fix = f"correct `white`, `mean` and `std` in the card{itself}"
-        return [Finding("range", BAD, f"{text}, but {errors[best]:.0%} with {best}", fix)]
+        return [named("range", BAD, f"{text}, but {errors[best]:.0%} with {best}", fix)]
     if errors[own] > _POOR_ERROR:
-        return [Finding("range", NOTE, text, "no other range is better: this network does not know such images")]
-    return [Finding("range", GOOD, text)]
+        return [named("range", NOTE, text, "no other range is better: this network does not know such images")]
+    return [named("range", GOOD, text)]
 
 
 def _error(network: Network, view: KnownView) -> float:
@@ -163,11 +166,11 @@ def _depth(network: Network, view: KnownView) -> list[Finding]:
     depth, known = _depth_at_known(network, view)
     if not known.any():
         fix = f"correct `valid` (it is {list(card.valid)}) or the range of the input"
-        return [Finding("values", BAD, "no pixel has a valid depth", fix)]
-    values = Finding("values", GOOD, f"{known.mean():.0%} of the pixels have a depth")
+        return [named("values", BAD, "no pixel has a valid depth", fix)]
+    values = named("values", GOOD, f"{known.mean():.0%} of the pixels have a depth")
     if known.mean() < 0.8 and card.kind != "points":
         fix = f"is `valid` = {list(card.valid)} in the units of the network's own output?"
-        values = Finding("values", NOTE, values.text, fix)
+        values = named("values", NOTE, values.text, fix)
     ratio = float(np.median(depth[known] / view.depth[known]))
     return [values, _units(network, view, ratio, depth[known]), *_normals(network, view, found.normals is not None),
             *_bounded(network, view), *_focal(found.focal, view)]  # fmt: skip
@@ -179,11 +182,11 @@ def _units(network: Network, view: KnownView, ratio: float, depth: NDArray[np.fl
     known = _depth_at_known(network, view)[1]
     slope = np.polyfit(view.depth[known], depth, 1)[0]
     if slope < 0 and card.relative != "inverse":
-        return Finding("units", BAD, "far things have smaller values than near ones", 'say `relative = "inverse"`')
+        return named("units", BAD, "far things have smaller values than near ones", 'say `relative = "inverse"`')
     if slope > 0 and card.relative == "inverse":
-        return Finding("units", BAD, "far things have larger values than near ones", 'say `relative = "depth"`')
+        return named("units", BAD, "far things have larger values than near ones", 'say `relative = "depth"`')
     if card.relative in ("depth", "inverse"):
-        return Finding("units", GOOD, f"relative ({card.relative}): brought to the unit of the run's points")
+        return named("units", GOOD, f"relative ({card.relative}): brought to the unit of the run's points")
     off = abs(np.log(ratio))
     text = f"{ratio:.2f} of the known metres"
     scale_x, scale_y = network.box(view.camera.width, view.camera.height).scale
@@ -195,11 +198,11 @@ def _units(network: Network, view: KnownView, ratio: float, depth: NDArray[np.fl
         guesses[focal / 1000] = "its depth is canonical and not scaled: say `canonical_focal = 1000`"
     factor = min(guesses, key=lambda f: abs(np.log(ratio * f)))
     if off > _LOG_OFF and abs(np.log(ratio * factor)) < off / 2:
-        return Finding("units", BAD, f"{text}, {ratio * factor:.2f} by another convention", guesses[factor])
+        return named("units", BAD, f"{text}, {ratio * factor:.2f} by another convention", guesses[factor])
     if off > np.log(2) and not card.relative:
         fix = "compare it with a recording whose size you know before you rely on its metres"
-        return Finding("units", NOTE, text, fix)
-    return Finding("units", GOOD, text)
+        return named("units", NOTE, text, fix)
+    return named("units", GOOD, text)
 
 
 def _normals(network: Network, view: KnownView, used: bool) -> list[Finding]:
@@ -209,14 +212,14 @@ def _normals(network: Network, view: KnownView, used: bool) -> list[Finding]:
     vectors = given if given.shape[-1] == 3 else given.transpose(1, 2, 0)
     length = float(np.median(np.linalg.norm(np.nan_to_num(vectors.astype(np.float32)), axis=-1)))
     if abs(length - 1) > _LENGTH_TOLERANCE:
-        return [Finding("normals", NOTE, f"are {length:.2f} long where 1 is expected", "they are scaled to 1")]
+        return [named("normals", NOTE, f"are {length:.2f} long where 1 is expected", "they are scaled to 1")]
     if not used:
-        return [Finding("normals", NOTE, "do not fit the network's own depth: other axes", "they are not used")]
+        return [named("normals", NOTE, "do not fit the network's own depth: other axes", "they are not used")]
     truth = normals_in_cam(view.depth, view.camera)
     ours = network_depth(network, view.image, view.camera).normals
     cosine = (truth * ours / 127).sum(-1)[np.abs(truth).sum(-1) > 0] if ours is not None else np.zeros(1)
     angle = float(np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1)))))
-    return [Finding("normals", GOOD if angle < 30 else NOTE, f"median angle to the known ones {angle:.0f} degrees")]
+    return [named("normals", GOOD if angle < 30 else NOTE, f"median angle to the known ones {angle:.0f} degrees")]
 
 
 def _bounded(network: Network, view: KnownView) -> list[Finding]:
@@ -227,7 +230,7 @@ def _bounded(network: Network, view: KnownView) -> list[Finding]:
         if role in outputs and (np.nan_to_num(outputs[role], nan=-1.0) < 0).mean() + (outputs[role] > 1).mean() > 0.01:
             low, high = float(np.nanmin(outputs[role])), float(np.nanmax(outputs[role]))
             fix = f"leave `{role}` out of the card, or end the graph with a sigmoid"
-            found.append(Finding(role, BAD, f"runs from {low:.2g} to {high:.2g} where 0..1 is expected", fix))
+            found.append(named(role, BAD, f"runs from {low:.2g} to {high:.2g} where 0..1 is expected", fix))
     return found
 
 
@@ -235,7 +238,7 @@ def _focal(focal: float | None, view: KnownView) -> list[Finding]:
     if focal is None:
         return []
     off = focal / view.camera.fx - 1
-    return [Finding("focal length", GOOD if abs(off) < 0.25 else NOTE, f"its points imply {off:+.0%} of the known one")]
+    return [named("focal length", GOOD if abs(off) < 0.25 else NOTE, f"its points imply {off:+.0%} of the known one")]
 
 
 def _segmentation(network: Network, view: KnownView) -> list[Finding]:
@@ -246,15 +249,15 @@ def _segmentation(network: Network, view: KnownView) -> list[Finding]:
     found = []
     if card.kind == "argmax" and (output.min() < 0 or output.max() >= len(card.classes)):
         text = f"ids from {output.min():g} to {output.max():g}, the card has {len(card.classes)} classes"
-        found.append(Finding("values", BAD, text, "correct `classes`, or `kind`"))
+        found.append(named("values", BAD, text, "correct `classes`, or `kind`"))
     if card.kind in ("logits", "probabilities", ""):
         sums = output.sum(0)
         are_shares = output.min() > -1e-3 and np.abs(sums - 1).max() < 0.02
         if are_shares != (card.kind == "probabilities"):
             seen = "probabilities" if are_shares else "logits"
             text = f"{output.min():.3g} to {output.max():.3g}, sums {sums.min():.3g} to {sums.max():.3g}"
-            found.append(Finding("values", BAD, f"{text}: these are {seen}", f'say `kind = "{seen}"`'))
-    return found or [Finding("values", GOOD, f"{output.shape[0]} planes of {output.shape[-1]}x{output.shape[-2]}")]
+            found.append(named("values", BAD, f"{text}: these are {seen}", f'say `kind = "{seen}"`'))
+    return found or [named("values", GOOD, f"{output.shape[0]} planes of {output.shape[-1]}x{output.shape[-2]}")]
 
 
 def _tokens(network: Network, view: KnownView, output: NDArray[np.float32]) -> list[Finding]:
@@ -267,12 +270,12 @@ def _tokens(network: Network, view: KnownView, output: NDArray[np.float32]) -> l
         fitting = (p for p in _PATCHES if output.shape[0] - (sides[0] // p) * (sides[1] // p) in _TOKENS_BEFORE)
         patch = next(fitting, None)
         fix = f"say `multiple = {patch}`" if patch else "this network's tokens are not those of its patches"
-        return [Finding("tokens", BAD, text, fix)]
+        return [named("tokens", BAD, text, fix)]
     text = f"{text}: {_TOKENS_BEFORE[extra]}"
     if extra > 1 and network.head is not None:
         fix = "take the head that was trained for it, or the network without registers"
-        return [Finding("tokens", BAD, f"{text}; the head is that of a network without registers", fix)]
-    return [Finding("tokens", GOOD, text)]
+        return [named("tokens", BAD, f"{text}; the head is that of a network without registers", fix)]
+    return [named("tokens", GOOD, text)]
 
 
 def _wrong_classes(network: Network, view: KnownView) -> float:
@@ -287,10 +290,10 @@ def _person(network: Network, view: KnownView) -> list[Finding]:
     output = network.run(view.image, network.box(view.camera.width, view.camera.height))["output"]
     if output.min() < -1e-3 or output.max() > 1.001:
         text = f"{output.min():.2g} to {output.max():.2g} where a probability is expected"
-        return [Finding("values", BAD, text, "end the graph with a sigmoid")]
+        return [named("values", BAD, text, "end the graph with a sigmoid")]
     share = float((output > 0.5).mean())
     state = GOOD if share < 0.1 else NOTE
-    return [Finding("values", state, f"{share:.1%} of an image without people is taken for one")]
+    return [named("values", state, f"{share:.1%} of an image without people is taken for one")]
 
 
 def known_view() -> KnownView:

@@ -23,9 +23,9 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import CUBE, rig_of
 from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import CALIBRATION, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.scene.world import WORLD
 from tests.benchmarks.worlds.panorama import render_panorama
 from tests.world.build import World

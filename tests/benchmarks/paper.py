@@ -30,12 +30,12 @@ from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.formats.textfile import read_json_object, write_json
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.paper import stages, uncertainty
 from msgs_slam.pipelines.paper.uncertainty import PAPER, Constants
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import all_stages, reconstruct
-from msgs_slam.pipelines.run.folder import RunFolder, load_records
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.system.progress import SilentProgress
 
 OFFICE = ROOT.parent / "shared" / "data" / "replica_office0"
@@ -94,7 +94,7 @@ def measured(
     stages.constants_of = uncertainty.constants_of = lambda config: constants  # in every stage of this process
     reconstruct(source, run, config, SilentProgress(), until="global_ba")
     file = run.root.with_suffix(".json")
-    stamp = {name: record.content for name, record in load_records(run).items()}
+    stamp = {name: record.content for name, record in run.records.items()}
     if not file.exists() or read_json_object(file)["stamp"] != stamp:
         write_json(file, {"stamp": stamp, "figures": evaluate_outcome(load_outcome(run), truth, SilentProgress())})
     return read_json_object(file)["figures"]

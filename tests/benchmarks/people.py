@@ -36,11 +36,11 @@ from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
 from msgs_slam.pipelines.masks.people import person_probability
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.networks.session import Network
-from msgs_slam.pipelines.outcome import Outcome, load_outcome
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import CALIBRATION, FRAMES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.sfm.lens import FramePixels
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Intrinsics

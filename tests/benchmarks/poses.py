@@ -162,8 +162,8 @@ def measure(name: str, form: str, work: Path, settings: list[str], until: str) -
     """One row: the stages run, the poses compared."""
     from mechanisms import watched
 
-    from msgs_slam.pipelines.read_config import load_config
     from msgs_slam.pipelines.run.folder import RunFolder
+    from msgs_slam.pipelines.run.settings import load_config
 
     case = recordings(work)[name][form]
     source = prepare(name, case, work)

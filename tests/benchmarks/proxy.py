@@ -37,10 +37,10 @@ from msgs_slam.formats.image_folder import natural_key
 from msgs_slam.formats.images import read_depth_png
 from msgs_slam.pipelines.geometry.camera import project, resample_nearest, unproject_depth
 from msgs_slam.pipelines.proxy import selection
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, CLASSES, FIGURES, FRAMES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Frame, ProxyMaps
 

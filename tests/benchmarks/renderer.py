@@ -33,11 +33,11 @@ import torch
 from render_scenes import room
 from torch import Tensor
 
-from msgs_slam.pipelines.compute.threads import set_threads
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.mapping import losses
 from msgs_slam.pipelines.mapping.losses import photo_loss
 from msgs_slam.pipelines.render.api import Rendering, choose_backend, composite, project_map, render
+from msgs_slam.pipelines.system.threads import set_threads
 
 ROWS = [(320, 240, 50_000, 8), (320, 240, 200_000, 8), (640, 480, 200_000, 8), (640, 480, 200_000, 40)]
 BACKENDS = {"reference": reference}

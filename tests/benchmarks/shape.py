@@ -33,9 +33,9 @@ from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.evaluation.views import render_outcome
 from msgs_slam.pipelines.geometry.camera import resample_nearest
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import CALIBRATION, FRAMES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.sfm.lens import FramePixels
 from msgs_slam.pipelines.types import Frame
 

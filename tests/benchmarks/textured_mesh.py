@@ -21,11 +21,11 @@ from scipy.ndimage import binary_fill_holes
 
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.ply import read_mesh_ply
-from msgs_slam.pipelines.compute.raster import draw_faces
 from msgs_slam.pipelines.evaluation.metrics import psnr
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.scene.world import WORLD
+from msgs_slam.pipelines.system.raster import draw_faces
 from msgs_slam.pipelines.types import Intrinsics
 
 SAMPLES = 2

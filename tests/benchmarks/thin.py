@@ -27,11 +27,11 @@ from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.evaluation.views import render_outcome
 from msgs_slam.pipelines.geometry.camera import resample_nearest
-from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import FRAMES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.system.progress import SilentProgress
 from tests.benchmarks.worlds.stairwell import BAR
 from tests.world import ClipOptions, make_world, write_sequence

@@ -219,8 +219,8 @@ def write_walk(folder: Path, layout: str, texel: float = 0.006, **options: Any) 
 
 def measure_ours(name: str, work: Path, settings: Sequence[str], until: str) -> dict[str, Any]:
     """Run the stages and compare the trajectory with the truth."""
-    from msgs_slam.pipelines.read_config import load_config
     from msgs_slam.pipelines.run.folder import RunFolder
+    from msgs_slam.pipelines.run.settings import load_config
 
     case = walk_case(name, work) if name.startswith("walk_") else cases(work)[name]
     source = prepare(name, case, work)
@@ -250,14 +250,13 @@ def run_stages_timed(
     """The stages' records, and what each took; of a stage that is up to date, what it took when it ran."""
     from msgs_slam.pipelines.config import STAGES
     from msgs_slam.pipelines.reconstruct import reconstruct
-    from msgs_slam.pipelines.run.folder import load_records
     from msgs_slam.pipelines.system.progress import SilentProgress
 
     stored = run.root.with_suffix(".seconds.json")
     seconds = json.loads(stored.read_text()) if stored.exists() else {}
     wanted = STAGES[: STAGES.index(until) + 1]
     for stage in wanted:
-        before = load_records(run).get(stage)
+        before = run.records.get(stage)
         clock, cpu = time.monotonic(), time.process_time()
         records = reconstruct(source, run, config, SilentProgress(), stage)
         if records[stage] != before:

@@ -30,9 +30,9 @@ from msgs_slam.pipelines.evaluation.evaluate import trajectory_cells
 from msgs_slam.pipelines.evaluation.metrics import SurfaceError, surface_error, true_surface
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.types import Intrinsics
 
 Array = NDArray[np.float64]

@@ -19,8 +19,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.pipelines.evaluation.metrics import true_surface
 from msgs_slam.pipelines.evaluation.truth import absolute_error, match_truth
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.scene.world import find_upright, upright_world
 
 

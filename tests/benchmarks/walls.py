@@ -10,8 +10,8 @@ from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.export.floor_plan import Wall, find_walls, walls_of_run
 from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.scene.world import WORLD
 
 STEP, VIEWS, JUMP = 4, 30, 1.06

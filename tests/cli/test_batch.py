@@ -19,8 +19,8 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.msgs_cli.batch import _share
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.msgs_cli.output import Output
-from msgs_slam.pipelines import batch
-from msgs_slam.pipelines.batch import (
+from msgs_slam.pipelines.config import Config
+from msgs_slam.pipelines.reconstruct import (
     DONE,
     ELSEWHERE,
     FAILED,
@@ -28,12 +28,12 @@ from msgs_slam.pipelines.batch import (
     Job,
     find_recordings,
     reconstruct_one,
-    run_in_processes,
+    write_table,
 )
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.read_config import load_config, merge_settings
-from msgs_slam.pipelines.run.folder import RunFolder, load_settings
+from msgs_slam.pipelines.run.cluster import run_in_processes
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import locked
+from msgs_slam.pipelines.run.settings import load_config, merge_settings
 from msgs_slam.pipelines.system.progress import SilentProgress, Stopped, soft_stop
 from tests.pipelines import task_calls
 from tests.pipelines.frames.conftest import QUICK, render, sideways
@@ -83,7 +83,7 @@ def test_a_failure_costs_itself_only_and_a_second_call_does_what_is_left(recordi
 
 def reconstruct_here(recording: BatchItem, **settings: object) -> str:
     config = load_config(None, QUICK, merge_settings(Config(), settings, "test"))
-    return reconstruct_one(Job(recording, config, "frames", 0, Output()), SilentProgress())
+    return reconstruct_one(Job(recording, config, "frames", 0, Output().task_progress), SilentProgress())
 
 
 def test_what_another_process_works_on_is_left_to_it(recordings: Path, tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_what_another_process_works_on_is_left_to_it(recordings: Path, tmp_path:
     walk.failure_file.write_text("of yesterday")
     assert reconstruct_here(walk, frames={"max_side": 200}) == DONE
     assert not walk.failure_file.exists()
-    assert load_settings(RunFolder(walk.run)).frames.max_side == 200
+    assert RunFolder(walk.run).settings().frames.max_side == 200
 
 
 def test_a_lost_process_costs_itself_only(tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ def test_a_signal_is_passed_on(tmp_path: Path) -> None:
 def test_a_killed_parent_leaves_no_process_behind(tmp_path: Path) -> None:
     marker = tmp_path / "begun"
     code = (
-        "from msgs_slam.pipelines.batch import run_in_processes\nfrom tests.pipelines import task_calls\n"
+        "from msgs_slam.pipelines.run.cluster import run_in_processes\nfrom tests.pipelines import task_calls\n"
         f"from pathlib import Path\nlist(run_in_processes(task_calls.wait, [Path({str(marker)!r})]))\n"
     )
     paths = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
@@ -214,11 +214,11 @@ def test_two_shards_write_the_table_at_the_same_moment(tmp_path: Path, monkeypat
             others.append(temporary)
             with monkeypatch.context() as other:
                 other.setattr(atomic, "process_token", lambda: "of the other")
-                batch.write_table(tmp_path, [{"recording": "b", "state": DONE}])
+                write_table(tmp_path, [{"recording": "b", "state": DONE}])
         replace(temporary, path)
 
     monkeypatch.setattr(atomic.os, "replace", interrupted)
-    batch.write_table(tmp_path, [{"recording": "a", "state": DONE}])
+    write_table(tmp_path, [{"recording": "a", "state": DONE}])
     assert set(rows(tmp_path)) == {"a"}
     assert sorted(p.name for p in tmp_path.iterdir()) == ["batch.json", "batch.md"]
 

@@ -11,7 +11,7 @@ import pytest
 from cli_runs import QUICK, FinishedRun, invoke
 from test_kill_and_resume import digests
 
-from msgs_slam.pipelines.run.folder import RunFolder, load_records
+from msgs_slam.pipelines.run.folder import RunFolder
 from tests.ray_nodes import two_nodes
 
 SUBMAPS = ("--set", "mapping.submap=5")
@@ -23,7 +23,7 @@ def test_two_nodes_of_which_one_is_lost_leave_what_one_process_does(
 ) -> None:
     alone, shared = copied_run("alone.msgs"), tmp_path / "shared.msgs"
     assert invoke("resume", alone, *SUBMAPS, "-q").exit_code == 0
-    assert load_records(RunFolder(alone))["mapping"].figures["submaps"] == 3
+    assert RunFolder(alone).records["mapping"].figures["submaps"] == 3
 
     killed: list[str] = []
 

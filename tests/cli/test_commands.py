@@ -21,7 +21,7 @@ from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.export.kinds import export_of
 from msgs_slam.pipelines.reconstruct import existing_config
-from msgs_slam.pipelines.run.folder import RunFolder, save_settings
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
 
 
@@ -176,7 +176,7 @@ def run_of(out: Path, digest: str = "0") -> RunFolder:
     """A run of another source, of which no stage is done."""
     run = RunFolder(out)
     write_manifest(run.manifest_file, Manifest(Source("other.mp4", digest), {}))
-    save_settings(run, Config())
+    run.save_settings(Config())
     return run
 
 
@@ -343,7 +343,7 @@ def test_commands_that_look_at_a_run_keep_to_its_threads(
     def asked(threads: int) -> None:
         raise InputError(f"{threads} threads")
 
-    monkeypatch.setattr("msgs_slam.pipelines.run.tasks.limit_threads", asked)
+    monkeypatch.setattr("msgs_slam.pipelines.system.threads.limit_threads", asked)
     run = finished_run.folder
     for words in (
         ("export", run, "--to", tmp_path / "out"), ("render", run, tmp_path / "film.avi"), ("report", run),

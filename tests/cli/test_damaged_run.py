@@ -10,7 +10,7 @@ from cli_runs import invoke
 from msgs_slam.formats.errors import InputError
 from msgs_slam.msgs_cli.output import format_table
 from msgs_slam.pipelines.evaluation.serve import page_of_run
-from msgs_slam.pipelines.run.folder import RunFolder, load_records
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.wording import figure_text, lost_text, stretches
 
 USED_BY = {
@@ -65,12 +65,12 @@ def test_a_damaged_page_is_not_shown(copied_run: Callable[[str], Path]) -> None:
 
 def test_damaged_export_is_made_again(copied_run: Callable[[str], Path]) -> None:
     run = copied_run("run.msgs")
-    before = load_records(RunFolder(run))["export"].content
+    before = RunFolder(run).records["export"].content
     spoil(run / "export" / "mesh.ply", "flipped")
     spoil(run / "export" / "point_cloud.ply", "cut")
     assert json.loads(invoke("status", run, "--json").stdout)["stages"][-1]["state"] == "damaged"
     assert invoke("resume", run, "-q").exit_code == 0
-    assert load_records(RunFolder(run))["export"].content == before
+    assert RunFolder(run).records["export"].content == before
     found = json.loads(invoke("status", run, "--json").stdout)
     assert [s["state"] for s in found["stages"]] == ["done"] * 6
     assert found["warnings"] == []

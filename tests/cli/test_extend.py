@@ -16,7 +16,7 @@ from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.geometry.se3 import align_points, inverse
 from msgs_slam.pipelines.run.files import MAP, TRAJECTORY
-from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings, load_source
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import locked
 from msgs_slam.pipelines.run.manifest import read_manifest, write_manifest
 from msgs_slam.pipelines.source.extending import add_videos, is_added
@@ -120,7 +120,7 @@ def test_stopped_at_any_write_it_is_the_old_run_or_the_extended_one(
     made: bool, videos: Videos, copied: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Stopped before or after each file of the change takes its name: one of the two, with its settings."""
-    config, rename, seen = load_settings(RunFolder(videos.run)), os.replace, []
+    config, rename, seen = RunFolder(videos.run).settings(), os.replace, []
     for stop in itertools.count():
         run, count = RunFolder(copied(f"{stop}.msgs")), itertools.count()
 
@@ -138,8 +138,8 @@ def test_stopped_at_any_write_it_is_the_old_run_or_the_extended_one(
                 break
             except KeyboardInterrupt:
                 pass
-        assert load_settings(run) == config
-        records, path = load_records(run), Path(load_source(run).path)
+        assert run.settings() == config
+        records, path = run.records, Path(run.source.path)
         assert path in (videos.first.resolve(), run.root / "extension_1" / "source.videos")
         is_old = path == videos.first.resolve()
         assert list(records) == (list(STAGES) if is_old else [])
@@ -149,7 +149,7 @@ def test_stopped_at_any_write_it_is_the_old_run_or_the_extended_one(
     assert seen == sorted(seen, reverse=True), "once extended it stays so"
     assert len(seen) > 2
     assert is_added(run, [videos.second])
-    assert load_settings(run) == config, "its first line is of the run before, until the first stage begins"
+    assert run.settings() == config, "its first line is of the run before, until the first stage begins"
 
 
 def test_while_another_process_works_on_it_nothing_is_begun(videos: Videos, copied: Callable[[str], Path]) -> None:
@@ -158,7 +158,7 @@ def test_while_another_process_works_on_it_nothing_is_begun(videos: Videos, copi
         refused = invoke("extend", run.root, videos.second)
     assert refused.exit_code == 1
     assert "another msgs-slam process is working on this run" in refused.output.replace("\n", " ")
-    assert list(load_records(run)) == list(STAGES)
+    assert list(run.records) == list(STAGES)
 
 
 def test_killed_it_goes_on_and_ends_with_the_same_bytes(

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from cli_runs import QUICK, FinishedRun
 
-from msgs_slam.msgs_cli.json_lines import json_outcome
+from msgs_slam.msgs_cli.output import json_outcome
 
 COMMAND = [sys.executable, "-m", "msgs_slam"]
 JSON = ("--log-format", "json")

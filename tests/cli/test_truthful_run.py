@@ -16,7 +16,7 @@ from cli_runs import OPTIONS, FinishedRun, invoke
 from msgs_slam.formats.errors import InputError
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.reconstruct import made_with, reconstruct
-from msgs_slam.pipelines.run.folder import RunFolder, load_records
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import locked
 from msgs_slam.pipelines.run.manifest import keyframe_psnr
 from msgs_slam.pipelines.system.progress import SilentProgress
@@ -46,7 +46,7 @@ LATER = ("mapping", "global_ba", "export")
 def test_every_place_gives_one_psnr(finished_run: FinishedRun, copied_run: Callable[[str], Path]) -> None:
     """Status, report, evaluation and the list of a batch, whatever each of them renders besides."""
     run = copied_run("run.msgs")
-    records = load_records(RunFolder(run))
+    records = RunFolder(run).records
     value = keyframe_psnr(records)
     assert value is not None
     assert value > 15
@@ -91,7 +91,7 @@ def test_changed_setting_then_ctrl_c(finished_run: FinishedRun, copied_run: Call
     assert stopped.returncode == 130
     assert f"msgs-slam resume {run}" in stopped.stderr
 
-    assert list(load_records(RunFolder(run))) == ["frames", "proxy", "tracking"]
+    assert list(RunFolder(run).records) == ["frames", "proxy", "tracking"]
     expected = {"frames": "done", "tracking": "done", "mapping": "interrupted"}
     assert states(run) == expected | {"global_ba": "outdated", "export": "outdated"}
     # The old map is not the map of these settings: whoever asks for one is told so, and nobody measures it.

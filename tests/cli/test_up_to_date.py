@@ -11,10 +11,10 @@ import pytest
 from cli_runs import QUICK, FinishedRun, files_below, invoke
 
 from msgs_slam.pipelines.evaluation.serve import page_of_run
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run import stages
-from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_source
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.source.recording import open_recording
 from tests.pipelines.finished import note_finished
 
@@ -64,7 +64,7 @@ def test_a_stage_is_made_again_on_demand_with_the_networks_of_now(
     assert made.exit_code == 0, made.output
     assert "proxy and what follows are made again (as asked for)" in made.stderr
     assert made.stderr.count("] up to date") == 1
-    assert load_records(RunFolder(run))["proxy"].figures["semantics"] != "segments"
+    assert RunFolder(run).records["proxy"].figures["semantics"] != "segments"
     assert files_below(run / "frames", run / "tracking") == times, (
         "later results stay until their own new ones are ready"
     )
@@ -159,7 +159,7 @@ def test_another_format_is_not_called_another_source(finished_run: FinishedRun, 
     run.stage("frames").mkdir(parents=True)
     note_finished(run, ["frames"])
     source = Source(str(finished_run.truth), open_recording(finished_run.truth, "auto").digest)
-    write_manifest(run.manifest_file, Manifest(source, load_records(run)))
+    write_manifest(run.manifest_file, Manifest(source, run.records))
     before = contents(run.root)
     refused = " ".join(invoke("resume", run.root, "--set", "run.format=images").stderr.split())
     assert "run.format=images reads other images, times or cameras" in refused
@@ -169,8 +169,8 @@ def test_another_format_is_not_called_another_source(finished_run: FinishedRun, 
 
 def test_a_source_that_has_moved_is_asked_for(copied_run: Callable[[str], Path], tmp_path: Path) -> None:
     run = RunFolder(copied_run("run.msgs"))
-    source = replace(load_source(run), path=str(tmp_path / "gone" / "room.avi"))
-    write_manifest(run.manifest_file, Manifest(source, load_records(run)))
+    source = replace(run.source, path=str(tmp_path / "gone" / "room.avi"))
+    write_manifest(run.manifest_file, Manifest(source, run.records))
     assert invoke("resume", run.root, "--until", "frames").exit_code == 0
     refused = invoke("resume", run.root, "--set", "frames.rate=1")
     assert refused.exit_code == 1

@@ -22,9 +22,8 @@ from msgs_slam.pipelines.config import STAGES, Config
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.run import files as run_files
 from msgs_slam.pipelines.run import runner
-from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings, load_source
-from msgs_slam.pipelines.run.manifest import StageRecord
-from msgs_slam.pipelines.run.reads import Situation
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.reads import Situation, StageRecord
 from msgs_slam.pipelines.run.schema import RunFile
 from msgs_slam.pipelines.source.recording import open_recording
 from tests.networks import PICTURE, save_network
@@ -54,12 +53,12 @@ class World:
 
     @property
     def records(self) -> dict[str, StageRecord]:
-        return load_records(self.run)
+        return self.run.records
 
     def changed(self, config: Config | None = None, records: dict[str, StageRecord] | None = None) -> set[str]:
         """Stages that would be others with these settings, results of other stages, and the files as they are."""
         known, source = self.records, open_recording(self.given / "room.avi").digest
-        now = config or load_settings(self.run), records or known
+        now = config or self.run.settings(), records or known
         return {
             stage.name
             for stage in all_stages()
@@ -152,7 +151,7 @@ def test_any_byte_of_an_earlier_stage_changes_the_stages_that_have_opened_it_and
             assert world.changed(records={**records, stage: other}) == seen, path
             unread += not seen
     assert unread > 10
-    assert load_source(world.run).digest == open_recording(world.given / "room.avi").digest
+    assert world.run.source.digest == open_recording(world.given / "room.avi").digest
 
 
 def test_a_file_that_was_looked_for_counts_as_read(world: World) -> None:
@@ -169,7 +168,7 @@ def test_a_file_that_was_looked_for_counts_as_read(world: World) -> None:
 
 
 def test_settings_that_were_not_asked_for_change_nothing(world: World) -> None:
-    config, counts = load_settings(world.run), dict.fromkeys(STAGES, 0)
+    config, counts = world.run.settings(), dict.fromkeys(STAGES, 0)
     for section in fields(Config):
         values = getattr(config, section.name)
         for key in fields(values):
@@ -204,5 +203,5 @@ def table_of_files(*runs: dict[str, StageRecord]) -> str:
 
 
 def test_the_page_of_files_shows_who_leaves_and_who_reads_each(world: World, finished_run: FinishedRun) -> None:
-    runs = load_records(RunFolder(finished_run.folder)), world.records
+    runs = RunFolder(finished_run.folder).records, world.records
     assert table_of_files(*runs) in (Path(__file__).parents[2] / "docs" / "files.md").read_text()

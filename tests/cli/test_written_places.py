@@ -12,7 +12,7 @@ from cli_runs import FinishedRun, elsewhere, files_below, invoke
 
 from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.run import files
-from msgs_slam.pipelines.run.folder import RunFolder, load_records
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.manifest import Source, read_manifest, write_manifest
 from msgs_slam.pipelines.run.schema import RunFile
 from msgs_slam.pipelines.run.target import LIST
@@ -96,7 +96,7 @@ FOR_OTHERS = re.compile(r"\d+\.jpg|timestamps\.txt")
 
 
 def names(run: RunFolder) -> Iterator[tuple[str, str]]:
-    for stage, record in load_records(run).items():
+    for stage, record in run.records.items():
         if stage != STAGES[-1]:
             yield from ((stage, name) for name in record.files if not FOR_OTHERS.fullmatch(name))
 

@@ -4,9 +4,9 @@ from collections.abc import Iterable
 
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.run.ending import results
-from msgs_slam.pipelines.run.folder import RunFolder, save_settings
-from msgs_slam.pipelines.run.manifest import Manifest, Source, StageRecord, content_digest, settings_of, write_manifest
-from msgs_slam.pipelines.run.reads import Reads
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.manifest import Manifest, Source, content_digest, settings_of, write_manifest
+from msgs_slam.pipelines.run.reads import Reads, StageRecord
 
 
 def note_finished(
@@ -20,4 +20,4 @@ def note_finished(
         content, settings = content_digest(files), settings_of(config, name)
         records[name] = StageRecord(Reads(), files, seconds, 50 * seconds, {}, [], content, settings)
     write_manifest(run.manifest_file, Manifest(Source(source, ""), records))
-    save_settings(run, config)
+    run.save_settings(config)

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.run.tasks import Chunk
+from msgs_slam.pipelines.run.stages import Chunk
 from msgs_slam.pipelines.system.progress import Progress, stop_if_asked
 
 

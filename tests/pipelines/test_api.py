@@ -22,7 +22,7 @@ from msgs_slam.formats.trajectory import read_tum
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.run.files import FRAMES
-from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.system.identity import package_digest
 from msgs_slam.pipelines.system.progress import SilentProgress, StageEvent
 from tests.pipelines.frames.conftest import QUICK, render, sideways
@@ -100,9 +100,9 @@ def test_settings_are_a_dict_and_progress_is_told(tmp_path: Path, capsys: pytest
     nested = {"frames": {"max_features": 300}, "run.threads": 1}
     with pytest.raises(InputError, match="mapping"):  # a stop, long before the map
         msgs_slam.reconstruct(tmp_path / "walk", tmp_path / "a.msgs", {**numbers(changes), **nested}, StopAfterFrames())
-    settings = load_settings(RunFolder(tmp_path / "a.msgs"))
+    settings = RunFolder(tmp_path / "a.msgs").settings()
     assert (settings.frames.max_features, settings.run.threads) == (300, 1)
-    assert "frames" in load_records(RunFolder(tmp_path / "a.msgs"))
+    assert "frames" in RunFolder(tmp_path / "a.msgs").records
     with pytest.raises(InputError, match="nowhere"):
         msgs_slam.reconstruct(tmp_path / "walk", tmp_path / "a.msgs", {"proxy.depth": "files:nowhere"}, progress=True)
     assert "\r" not in capsys.readouterr().err

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from msgs_slam.formats.errors import InputError
 from msgs_slam.msgs_cli.options import chosen_config
 from msgs_slam.pipelines.config import Config, FramesConfig, ProxyConfig, config_to_dict
-from msgs_slam.pipelines.read_config import (
+from msgs_slam.pipelines.run.settings import (
     config_to_toml,
     load_config,
     merge_settings,

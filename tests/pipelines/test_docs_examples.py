@@ -15,10 +15,10 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.export.scene import ExportScene
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.proxy import selection
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.run.target import Target
 from msgs_slam.pipelines.scene.world import FIRST

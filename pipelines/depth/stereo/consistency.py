@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compute.lanes import any_lane, iota, lane_exp, load, maximum, min_scalar, splat, store, where
-from ...compute.threads import fused_kernel, inner
 from ...geometry.camera import project
 from ...geometry.sparse_model import SparseModel
+from ...system.lanes import any_lane, iota, lane_exp, load, maximum, min_scalar, splat, store, where
+from ...system.threads import fused_kernel, inner
 from ...types import Intrinsics
 from .lane_sampling import choose, corners, smallest
 from .volume import Bands

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...compute import gpu
+from ...system import gpu
 from . import matching as rules
 from .sweep import ALIKE
 from .volume import DIRECTIONS, TILE, UNREACHED, path_starts

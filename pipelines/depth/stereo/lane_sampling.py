@@ -7,7 +7,7 @@ from llvmlite import ir
 from numba import types
 from numpy.typing import NDArray
 
-from ...compute.lanes import (
+from ...system.lanes import (
     FLAGS,
     I32,
     I64,

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....formats.errors import InputError
+from ...geometry.sequence import Sequence, resize_area
 from ...geometry.sparse_model import SparseModel
-from ...providers import DepthEstimate, Sequence, resize_area
+from ...providers import DepthEstimate
 from ...system.parallel import LruCache, map_lookahead
 from ...system.progress import Progress
 from ...system.values import load_value, save_value

@@ -11,8 +11,8 @@ planes of the sweep.
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compute.lanes import splat, store
-from ...compute.threads import fused_kernel, inner
+from ...system.lanes import splat, store
+from ...system.threads import fused_kernel, inner
 from .lane_sampling import with_row_below
 from .volume import BLOCK, TILE, UNREACHED, Bands, CostVolume, pixel_of_tile, tiles_of
 from .window import (

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compute.lanes import load, splat, store
-from ...compute.threads import fused_kernel, inner
 from ...system.jit import kernel
+from ...system.lanes import load, splat, store
+from ...system.threads import fused_kernel, inner
 from .lane_sampling import smallest, smallest_of
 
 TILE = BAND_ROWS = 16

@@ -11,10 +11,10 @@ All that correlates is part of one kernel and takes sixteen pixels at once: rows
 import numpy as np
 from numpy.typing import NDArray
 
-from ...compute.lanes import iota, lane_exp, load, maximum, min_scalar, splat, store, where
-from ...compute.threads import fused_kernel, inner
 from ...providers import DepthEstimate
 from ...system.jit import kernel
+from ...system.lanes import iota, lane_exp, load, maximum, min_scalar, splat, store, where
+from ...system.threads import fused_kernel, inner
 from .lane_sampling import choose, interpolate, smallest, square_root
 from .volume import BAND_ROWS
 

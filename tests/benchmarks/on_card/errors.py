@@ -9,7 +9,6 @@ from render_scenes import IMAGES, NAMES, room
 from torch import Tensor
 
 import msgs_slam.pipelines.depth.stereo.matching as matching
-from msgs_slam.pipelines.compute.adam import descend
 from msgs_slam.pipelines.depth.stereo import cuda
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.depth.stereo.sweep import refine_inverse_depth, sweep_cost
@@ -19,6 +18,7 @@ from msgs_slam.pipelines.mapping.losses import expose, fit_exposure
 from msgs_slam.pipelines.mapping.objective import Objective, color_errors_on_card, fit_exposure_on_card
 from msgs_slam.pipelines.mapping.state import KEYS
 from msgs_slam.pipelines.render.api import Rendering, composite, in_view, project_map, render
+from msgs_slam.pipelines.system.adam import descend
 from on_card.rows import Rows
 from on_card.scenes import CARD, CPU, SIZES, StereoScene, mapper, step, stereo_scene, there, world_of
 from tests.dense_volumes import of_dense, to_dense

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from render_scenes import room
 from torch import Tensor
 
-from msgs_slam.pipelines.compute import gpu
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.depth.stereo.matching import StereoImages
 from msgs_slam.pipelines.depth.stereo.sweep import warps_to
@@ -25,6 +24,7 @@ from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View, make_view
 from msgs_slam.pipelines.render.api import render
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
+from msgs_slam.pipelines.system import gpu
 from msgs_slam.pipelines.types import ProxyMaps
 
 REHEARSAL = os.environ.get("TRITON_INTERPRET") == "1"

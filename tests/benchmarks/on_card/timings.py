@@ -10,11 +10,11 @@ import torch
 from renderer import POSE, Case
 
 import msgs_slam.pipelines.depth.stereo.matching as matching
-from msgs_slam.pipelines.compute.threads import get_threads
 from msgs_slam.pipelines.depth.stereo import cuda
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.depth.stereo.volume import Bands
 from msgs_slam.pipelines.render.api import render
+from msgs_slam.pipelines.system.threads import get_threads
 from on_card.rows import Rows, first_seconds, milliseconds, wait
 from on_card.scenes import CARD, CPU, REHEARSAL, SIZES, Place, mapper, step, stereo_scene, world_of
 

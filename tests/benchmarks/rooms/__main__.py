@@ -33,7 +33,8 @@ from msgs_slam.pipelines.depth.completion.network import complete
 from msgs_slam.pipelines.depth.fused import FusedDepth, measure_scale
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.geometry.camera import resample_nearest
-from msgs_slam.pipelines.providers import DepthEstimate, DepthProvider, Sequence
+from msgs_slam.pipelines.geometry.sequence import Sequence
+from msgs_slam.pipelines.providers import DepthEstimate, DepthProvider
 
 from .clip import Clip, make_clip
 from .furniture import furniture

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
+from msgs_slam.pipelines.geometry.sequence import Sequence
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.providers import Sequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics
 

@@ -23,9 +23,9 @@ from msgs_slam.pipelines.evaluation.write import evaluation_rows, evaluation_tab
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.mapping.move_map import rows_of
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.render.api import render
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.scene.world import WORLD, World
 from msgs_slam.pipelines.types import Frame
 from tests.matrices import write_matrices

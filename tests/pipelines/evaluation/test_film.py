@@ -31,9 +31,9 @@ from msgs_slam.pipelines.evaluation.film import (
 from msgs_slam.pipelines.evaluation.metrics import psnr
 from msgs_slam.pipelines.export.web_page import EXPORTED, RUN
 from msgs_slam.pipelines.geometry.se3 import Similarity
-from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.run.folder import RunFolder, load_records
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.scene.world import WORLD, World, cameras_up
 from tests.world import make_world, walk
 
@@ -68,7 +68,7 @@ def test_a_video_whose_name_has_no_suffix_is_no_folder(oracle_run: OracleRun, tm
     run, clip = oracle_run(), tmp_path / "clip"
     for there, is_folder in ((lambda: None, True), (lambda: clip.write_bytes(b"video"), False)):
         there()  # what is gone is judged by its name
-        write_manifest(run.manifest_file, Manifest(Source(str(clip), ""), load_records(run)))
+        write_manifest(run.manifest_file, Manifest(Source(str(clip), ""), run.records))
         assert load_outcome(RunFolder(run.root)).source_is_folder is is_folder
 
 

@@ -18,9 +18,9 @@ from msgs_slam.pipelines.evaluation.facts import (
     path_length,
 )
 from msgs_slam.pipelines.geometry.se3 import Similarity
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.scene.world import WORLD, World
 from msgs_slam.pipelines.types import Metres
 from tests.world.room import HEIGHT, LENGTH, WIDTH

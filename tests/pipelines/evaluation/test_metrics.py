@@ -23,8 +23,8 @@ from msgs_slam.pipelines.evaluation.metrics import DepthErrorSum, open_lpips, ps
 from msgs_slam.pipelines.evaluation.write import evaluation_table
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.networks.registry import ModelStore
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.types import Intrinsics
 from tests.networks import save_network
 

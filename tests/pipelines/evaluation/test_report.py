@@ -23,10 +23,10 @@ from msgs_slam.pipelines.evaluation.report import truth_section, write_report
 from msgs_slam.pipelines.evaluation.write import JUDGED, PATH_FROM_ABOVE, write_evaluation
 from msgs_slam.pipelines.geometry.se3 import Similarity
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import FRAMES, LEFT_OUT, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.manifest import read_manifest, write_manifest
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.scene.world import SAME, WORLD, World
 from msgs_slam.pipelines.types import LoopEdge
 from tests.browser import BROWSER, browser

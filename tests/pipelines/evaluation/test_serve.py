@@ -21,10 +21,10 @@ from msgs_slam.pipelines.evaluation.film import read_camera_path, render_run
 from msgs_slam.pipelines.evaluation.metrics import psnr
 from msgs_slam.pipelines.evaluation.serve import PageServer, page_of_run, progress_summary
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import BACKBONE, MAP, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import locked
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.run.progress import ProgressFile
 from msgs_slam.pipelines.system.progress import BEGUN, SilentProgress, StageEvent
 from tests.browser import BROWSER, browser

@@ -12,12 +12,12 @@ from ball import CAMERA, RADIUS, orbit, pixel_rays, see_ball, seen_points
 from numpy.typing import NDArray
 
 from msgs_slam.formats.ply import read_mesh_ply, write_mesh_ply
-from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.export.mesh import paint
 from msgs_slam.pipelines.export.surface import Region, Surface, Triangles, chunk_surfaces, closed, joined, weld
 from msgs_slam.pipelines.export.volume import CHUNK, Grid, Volume, fuse, make_grid
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.mapping.measure import MeshView
+from msgs_slam.pipelines.system.threads import get_threads, set_threads
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import VOID
 

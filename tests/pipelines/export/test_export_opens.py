@@ -20,9 +20,9 @@ from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.stage import WIDTH, export_run
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.files import SPARSE
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import Outcome, load_outcome
 
 OracleRun = Callable[..., RunFolder]
 

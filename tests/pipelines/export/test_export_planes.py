@@ -23,10 +23,9 @@ from msgs_slam.pipelines.export.mesh import (
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.geometry.voxels import Voxels
 from msgs_slam.pipelines.mapping.measure import MeshView
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.stages import StageContext
-from msgs_slam.pipelines.run.tasks import in_chunks
+from msgs_slam.pipelines.run.outcome import load_outcome
+from msgs_slam.pipelines.run.stages import StageContext, in_chunks
 from msgs_slam.pipelines.scene.world import SAME
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.system.values import load_value, save_value

@@ -26,10 +26,10 @@ from msgs_slam.pipelines.export.scene import ExportScene, find_world
 from msgs_slam.pipelines.export.stage import export_folder, export_run, licences
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import Similarity
-from msgs_slam.pipelines.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.files import FRAMES, LEFT_OUT, METRES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.lock import locked
+from msgs_slam.pipelines.run.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.run.target import LIST, Target
 from msgs_slam.pipelines.scene.world import WORLD
 from msgs_slam.pipelines.types import Metres

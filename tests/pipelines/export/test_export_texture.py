@@ -9,13 +9,13 @@ from ball import CAMERA, RADIUS, see_ball, seen_points
 from numpy.typing import NDArray
 
 from msgs_slam.formats.ply import MeshArrays
-from msgs_slam.pipelines.compute.raster import draw_faces
-from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.export import texture
 from msgs_slam.pipelines.export.surface import filled
 from msgs_slam.pipelines.export.texture import Atlas, Shot, owners, paint_texture, simplified, texels_wanted, unwrapped
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.system.raster import draw_faces
+from msgs_slam.pipelines.system.threads import get_threads, set_threads
 from msgs_slam.pipelines.types import VOID, Intrinsics
 
 FULL = CAMERA.resized(320, 240)

@@ -18,9 +18,9 @@ from msgs_slam.pipelines.config import Config, ExportConfig
 from msgs_slam.pipelines.export import splats
 from msgs_slam.pipelines.export.scene import ExportScene
 from msgs_slam.pipelines.export.stage import export_run
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.render.api import render
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.run.target import Target
 from msgs_slam.pipelines.scene.world import SAME, Georeference, World

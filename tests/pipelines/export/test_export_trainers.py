@@ -20,9 +20,9 @@ from msgs_slam.pipelines.export import colmap
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.sparse_model import FrameObservations, SparseModel
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import FRAME_OBSERVATIONS, LEFT_OUT, SPARSE
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.scene.world import WORLD, World
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState, sparse_model_of, to_frame_observations
 

@@ -15,9 +15,9 @@ from msgs_slam.formats.images import decode_rgb
 from msgs_slam.formats.ply import read_mesh_ply
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.stage import export_run, find_world
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import CLASSES
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.run.target import LIST
 from msgs_slam.pipelines.scene.world import WORLD
 

@@ -24,8 +24,8 @@ from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.export import web_page
 from msgs_slam.pipelines.export.scene import ExportScene
 from msgs_slam.pipelines.export.stage import export_run
-from msgs_slam.pipelines.outcome import Outcome, load_outcome, map_cloud
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import Outcome, load_outcome, map_cloud
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.run.target import Target
 from msgs_slam.pipelines.scene.world import FIRST, WORLD

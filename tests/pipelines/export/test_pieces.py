@@ -16,9 +16,9 @@ from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.evaluation.report import write_report
 from msgs_slam.pipelines.evaluation.serve import PageServer
 from msgs_slam.pipelines.geometry.se3 import align_points
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from tests.pipelines.frames.conftest import WALK_FRAMES, render, sideways, write_walk
 
 APART = 9

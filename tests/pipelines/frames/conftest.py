@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.system.progress import SilentProgress
 

@@ -17,7 +17,7 @@ from msgs_slam.formats.video_head import PART, WHOLE, image_sphere, video_sphere
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.frames.inputs import check_frames
 from msgs_slam.pipelines.geometry.camera import CUBE, ONE_CAMERA, Rig, rig_of
-from msgs_slam.pipelines.read_config import load_config
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.source.faces import find_faces, fisheye_face, has_panorama_shape, panorama_faces
 from msgs_slam.pipelines.source.recording import open_recording
 

@@ -17,8 +17,8 @@ from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.config import FramesConfig
 from msgs_slam.pipelines.frames.findings import _require_same_images
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import GIVEN_POSES
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.sfm.candidates import GIVEN, _selection_score
 from msgs_slam.pipelines.sfm.consistency import ModelReport
 from msgs_slam.pipelines.sfm.given import fit_given_poses, posed_model

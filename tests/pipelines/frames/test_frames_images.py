@@ -11,7 +11,7 @@ from pillow_heif import register_heif_opener
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png
 from msgs_slam.pipelines.frames.masks import FrameMasks, open_masks
-from msgs_slam.pipelines.read_config import load_config
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.types import Frame
 from tests.formats.test_formats_images import P3_IN_XYZ, icc_profile

@@ -26,7 +26,7 @@ from msgs_slam.pipelines.frames.learned import (
 from msgs_slam.pipelines.geometry.camera import project, unproject
 from msgs_slam.pipelines.masks.people import people_cards
 from msgs_slam.pipelines.networks.registry import ModelStore
-from msgs_slam.pipelines.read_config import load_config
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.sfm.matching import match_descriptors
 from msgs_slam.pipelines.types import Features
 from tests.networks import save_network

@@ -16,14 +16,14 @@ from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.frames.keyframes import pick_frames
 from msgs_slam.pipelines.frames.tasks import known_camera
-from msgs_slam.pipelines.outcome import load_outcome
-from msgs_slam.pipelines.providers import Sequence as ProxySequence
+from msgs_slam.pipelines.geometry.sequence import Sequence as ProxySequence
 from msgs_slam.pipelines.proxy.recording import RecordingDepth, RecordingLabels
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth_files, open_label_files
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.sfm.lens import FramePixels, distortion_of, make_lens, to_pycolmap
 from msgs_slam.pipelines.source.recording import DatasetRecording, FolderRecording, open_recording

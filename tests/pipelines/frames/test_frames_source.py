@@ -17,7 +17,7 @@ from msgs_slam.formats.video_streams import write_video
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.frames.stage import places_figure, run
 from msgs_slam.pipelines.reconstruct import one_source
-from msgs_slam.pipelines.run.folder import RunFolder, load_source
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.source.recording import FolderRecording, VideoRecording, open_recording
@@ -210,7 +210,7 @@ def test_videos_of_one_place_are_one_source(tmp_path: Path) -> None:
     digest = open_recording(run.root / "source.videos", "auto").digest
     write_manifest(run.manifest_file, Manifest(Source(str(run.root / "source.videos"), digest), {}))
     moved = RunFolder(run.root.rename(tmp_path / "moved.msgs"))
-    assert load_source(moved).path == str(moved.root / "source.videos")
+    assert moved.source.path == str(moved.root / "source.videos")
     (tmp_path / "both.videos").write_text("b.avi\na.avi\n")
     assert open_recording(tmp_path / "both.videos", "auto").digest != digest
     write_video(tmp_path / "b.avi", [_shade(9, 80)] * 2, 10.0)

@@ -16,16 +16,16 @@ from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.formats.textfile import read_json
 from msgs_slam.pipelines.frames.stage import run
 from msgs_slam.pipelines.geometry.se3 import align_points
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES, SPARSE
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.schema import dataclass_from_json
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.sfm import driver as sfm
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
 from msgs_slam.pipelines.source.recording import open_recording
 from msgs_slam.pipelines.system.machine import windows_of
 from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.system.values import dataclass_from_json
 from msgs_slam.pipelines.types import Calibration
 from tests.killed import KillAt, Killed
 from tests.pipelines.frames.conftest import QUICK, WALK_FRAMES, Walk, render, sideways, turn, write_walk

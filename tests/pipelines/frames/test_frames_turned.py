@@ -20,9 +20,9 @@ from msgs_slam.pipelines.geometry.se3 import align_points, inverse
 from msgs_slam.pipelines.masks.moving import _things
 from msgs_slam.pipelines.paper.rerender import _field_slopes
 from msgs_slam.pipelines.paper.slam import fitted_field
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Intrinsics

@@ -12,12 +12,12 @@ from msgs_slam.pipelines.frames.inputs import frames_division
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.ending import checksums
 from msgs_slam.pipelines.run.files import CALIBRATION
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.manifest import Manifest, Source, StageRecord, write_manifest
-from msgs_slam.pipelines.run.reads import Reads
+from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
+from msgs_slam.pipelines.run.reads import Reads, StageRecord
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.sfm.adjust import adjust_model, model_errors
 from msgs_slam.pipelines.sfm.consistency import judge
 from msgs_slam.pipelines.sfm.joining import (

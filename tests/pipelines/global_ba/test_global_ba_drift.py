@@ -19,7 +19,6 @@ from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.close import Edges, apply_step, optimise_pose_graph, residuals
 from msgs_slam.pipelines.global_ba.stage import run as run_global_ba
 from msgs_slam.pipelines.mapping.views import occurring_classes
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import (
     BACKBONE,
     CALIBRATION,
@@ -31,6 +30,7 @@ from msgs_slam.pipelines.run.files import (
     TRAJECTORY,
 )
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.types import Trajectory
 from tests.pipelines.global_ba.test_global_ba_stage import FIRST_AGAIN, seeded_map

@@ -20,7 +20,6 @@ from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.loops import FoundLoops
 from msgs_slam.pipelines.global_ba.stage import run as run_global_ba
 from msgs_slam.pipelines.mapping.views import occurring_classes
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.run.files import (
     BACKBONE,
@@ -34,6 +33,7 @@ from msgs_slam.pipelines.run.files import (
     TRAJECTORY,
 )
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.types import Trajectory
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames, small_motion

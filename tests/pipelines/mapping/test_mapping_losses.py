@@ -5,9 +5,9 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from msgs_slam.pipelines.compute.ssim import ssim_map
 from msgs_slam.pipelines.mapping import losses
 from msgs_slam.pipelines.mapping.losses import expose, fit_exposure, photo_loss, plain_photo_loss
+from msgs_slam.pipelines.system.ssim import ssim_map
 
 
 def pictures(dtype: torch.dtype = torch.float32, size: tuple[int, int] = (24, 31)) -> tuple[torch.Tensor, torch.Tensor]:

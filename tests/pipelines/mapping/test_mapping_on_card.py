@@ -15,7 +15,6 @@ if not ON_CARD:
     os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported and again when the kernels are
 pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip install '.[cuda-check]'")
 
-from msgs_slam.pipelines.compute import gpu  # noqa: E402
 from msgs_slam.pipelines.config import MappingConfig  # noqa: E402
 from msgs_slam.pipelines.mapping import growth, losses  # noqa: E402
 from msgs_slam.pipelines.mapping.losses import expose, fit_exposure  # noqa: E402
@@ -33,6 +32,7 @@ from msgs_slam.pipelines.mapping.state import (  # noqa: E402
 from msgs_slam.pipelines.mapping.views import MappingInput, View  # noqa: E402
 from msgs_slam.pipelines.render import cuda  # noqa: E402
 from msgs_slam.pipelines.render.api import Rendering  # noqa: E402
+from msgs_slam.pipelines.system import gpu  # noqa: E402
 from msgs_slam.pipelines.types import VOID, Intrinsics  # noqa: E402
 from tests.card_builds import build  # noqa: E402
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import project_gaussians
@@ -22,6 +21,7 @@ from msgs_slam.pipelines.mapping.optimise import MapOptimiser, OptimisedMap, opt
 from msgs_slam.pipelines.mapping.schedule import Step
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import MappingInput, View
+from msgs_slam.pipelines.system.threads import get_threads, set_threads
 from msgs_slam.pipelines.types import VOID
 from tests.killed import KillAt, Killed
 

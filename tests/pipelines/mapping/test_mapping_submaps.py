@@ -20,9 +20,9 @@ from msgs_slam.pipelines.mapping import optimise, submaps
 from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping.stage import refine_map
 from msgs_slam.pipelines.mapping.submaps import BORDER, SeenExposures, common_exposure, divide, nearest_seeing
-from msgs_slam.pipelines.outcome import load_outcome, maps_around
 from msgs_slam.pipelines.run.files import DEPTH_FIELDS, MAP, SUBMAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome, maps_around
 from msgs_slam.pipelines.run.schema import RunFile
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.system.machine import MIN_SUBMAP, submap_size

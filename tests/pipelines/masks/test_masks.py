@@ -26,8 +26,8 @@ from msgs_slam.pipelines.masks.people import PeopleFinder, join_people, people_c
 from msgs_slam.pipelines.masks.static import divide_regions, judge_static, regions_of, things_of
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.providers import DepthEstimate, LabelEstimate
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.render.api import Rendering
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.sfm.features import sift_features
 from msgs_slam.pipelines.sfm.flow import find_corners
 from msgs_slam.pipelines.source.recording import open_recording

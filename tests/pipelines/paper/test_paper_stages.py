@@ -12,7 +12,6 @@ from click.testing import CliRunner
 from finished import note_finished
 
 from msgs_slam.msgs_cli.main import main
-from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.config import Config, RunConfig
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.geometry.se3 import align_points
@@ -20,12 +19,13 @@ from msgs_slam.pipelines.paper import stages
 from msgs_slam.pipelines.paper.mapping import grow
 from msgs_slam.pipelines.paper.slam import Slam
 from msgs_slam.pipelines.paper.uncertainty import PAPER, constants_of
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.run.files import CLASS_IDS, CLASSES, DEPTH_FIELDS, MAP, SPARSE, TRAJECTORY
-from msgs_slam.pipelines.run.folder import RunFolder, load_settings
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.system.threads import get_threads, set_threads
 from msgs_slam.pipelines.types import Trajectory
 from tests.networks import save_network
 from tests.pipelines.mapping.small_run import make_run
@@ -223,7 +223,7 @@ def test_features_of_dinov2_reach_labels_and_loops(
     chosen = ["--semantics", f"onnx:{dinov2_like(tmp_path)}", "--set", "frames.rate=2"]
     done = CliRunner().invoke(main, ["reconstruct", *words, *chosen])
     assert done.exit_code == 0, done.output
-    config = load_settings(run)
+    config = run.settings()
     (folder := tmp_path / "global_ba").mkdir()
     context = StageContext(run, run.root, config, folder, SilentProgress())
     recording = stages.FrameViews(context)

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from msgs_slam.formats.images import write_grey_png, write_rgb
 from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.geometry.camera import project
+from msgs_slam.pipelines.geometry.sequence import Sequence
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.providers import Sequence
 from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics
 from tests.world import WorldFrame
 

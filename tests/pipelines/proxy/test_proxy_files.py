@@ -13,8 +13,9 @@ from msgs_slam.formats.datasets.sequence import find_class_table, read_class_tab
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
 from msgs_slam.pipelines.depth.files import FilesDepth, frame_key, match_files
+from msgs_slam.pipelines.geometry.sequence import Sequence
 from msgs_slam.pipelines.labels.files import FilesLabels
-from msgs_slam.pipelines.providers import DepthEstimate, Sequence
+from msgs_slam.pipelines.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.selection import (
     _before_frames,
     check_proxy,
@@ -23,7 +24,7 @@ from msgs_slam.pipelines.proxy.selection import (
     open_learned_depth,
     open_learned_semantics,
 )
-from msgs_slam.pipelines.read_config import load_config
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics
 

@@ -19,7 +19,7 @@ from msgs_slam.pipelines.config import ProxyConfig
 from msgs_slam.pipelines.networks import registry
 from msgs_slam.pipelines.networks.registry import Model, ModelStore, fetch
 from msgs_slam.pipelines.proxy.selection import choose_depth
-from msgs_slam.pipelines.read_config import load_config
+from msgs_slam.pipelines.run.settings import load_config
 
 DATA = np.random.default_rng(0).bytes(700_000)
 SHA = hashlib.sha256(DATA).hexdigest()
@@ -120,7 +120,7 @@ def test_only_https_is_downloaded_from(tmp_path: Path) -> None:
 
 
 def store(folder: Path, url: str, sha256: str = SHA) -> ModelStore:
-    model = Model("net", "metric3d-community", (f"{url}/m",), len(DATA), sha256, "MIT", True)
+    model = Model("net", "metric3d-community", len(DATA), sha256, "MIT", True, (f"{url}/m",))
     return ModelStore(folder, (model,), ModelStore.open(folder).families)
 
 
@@ -152,7 +152,7 @@ def test_an_unknown_hash_is_refused_unless_trusted_and_then_recorded(
         models.pull(models.get("net"), silent)
     assert server[1].requests == []
     models.pull(models.get("net"), silent, trust=True)
-    assert models._load_own()["pinned"] == {"net": SHA}
+    assert models._load_own().pinned == {"net": SHA}
 
 
 def test_a_replaced_file_is_refused_and_said_to_be_replaced(server: tuple[str, Behaviour], tmp_path: Path) -> None:
@@ -235,13 +235,13 @@ def test_a_model_that_needs_another_is_here_when_both_are(server: tuple[str, Beh
     assert card.labels[0] == "wall"
     assert {"floor", "ceiling", "seating", "table", "other"} <= set(card.labels)
     assert len(card.labels) == 18
-    head = Model("head", "head", (f"{server[0]}/head",), 0, "", "MIT", True)
-    body = Model("net", "dinov2-ade20k", (f"{server[0]}/m",), len(DATA), SHA, "MIT", True, needs="head")
+    head = Model("head", "head", 0, "", "MIT", True, (f"{server[0]}/head",))
+    body = Model("net", "dinov2-ade20k", len(DATA), SHA, "MIT", True, (f"{server[0]}/m",), needs="head")
     pair = ModelStore(tmp_path, (body, head), models.families)
     pair.pull(body, silent)
     assert pair.first_here("segmentation") is None
     pair.pull(head, silent, trust=True)
-    pinned = Model("head", "head", head.urls, 0, SHA, "MIT", True)
+    pinned = Model("head", "head", 0, SHA, "MIT", True, head.urls)
     assert ModelStore(tmp_path, (body, pinned), models.families).first_here("segmentation") == body
 
 

@@ -17,8 +17,9 @@ from msgs_slam.pipelines.depth.fused import FusedDepth, fuse_with_stereo, measur
 from msgs_slam.pipelines.depth.stereo import provider as stereo_provider
 from msgs_slam.pipelines.depth.stereo.consistency import sweep_range
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
+from msgs_slam.pipelines.geometry.sequence import Sequence
 from msgs_slam.pipelines.labels.segments import SegmentLabels
-from msgs_slam.pipelines.providers import DepthEstimate, Sequence
+from msgs_slam.pipelines.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.maps import mean_iou
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth
 from msgs_slam.pipelines.system.progress import SilentProgress

@@ -14,13 +14,14 @@ from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.images import read_depth_png, read_rgb
 from msgs_slam.pipelines.evaluation.labels import count_labels, match_classes, score
 from msgs_slam.pipelines.geometry.camera import resample_nearest
+from msgs_slam.pipelines.geometry.sequence import Sequence
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.labels.learned import OnnxLabels
 from msgs_slam.pipelines.networks.card import Card
 from msgs_slam.pipelines.networks.network_pass import ResultCache, Workplace
 from msgs_slam.pipelines.networks.registry import ModelStore
 from msgs_slam.pipelines.networks.session import Network
-from msgs_slam.pipelines.providers import _COMMON, DepthEstimate, Sequence, class_colors
+from msgs_slam.pipelines.providers import _COMMON, DepthEstimate, class_colors
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics
 from tests.network_labels import network_labels

@@ -10,11 +10,12 @@ import pytest
 from numpy.typing import NDArray
 from proxy_room import Room
 
+from msgs_slam.pipelines.geometry.sequence import Sequence
 from msgs_slam.pipelines.labels.learned import OnnxClusters, spherical_kmeans
 from msgs_slam.pipelines.networks import network_pass
 from msgs_slam.pipelines.networks.card import read_card
 from msgs_slam.pipelines.networks.network_pass import Arrays, NetworkPass, ResultCache, Workplace
-from msgs_slam.pipelines.providers import DepthEstimate, Sequence
+from msgs_slam.pipelines.providers import DepthEstimate
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics
 from tests.networks import color_tokens

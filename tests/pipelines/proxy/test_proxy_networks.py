@@ -15,13 +15,13 @@ from onnx import TensorProto, helper
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import read_rgb
 from msgs_slam.pipelines.depth.learned import OnnxDepth
+from msgs_slam.pipelines.geometry.sequence import Sequence
 from msgs_slam.pipelines.networks.card import Card, read_card
 from msgs_slam.pipelines.networks.network_pass import ResultCache, Workplace
 from msgs_slam.pipelines.networks.outputs import class_token, network_depth, solve_shift, solve_shift_and_focal
 from msgs_slam.pipelines.networks.runtime import external_locations, require_own_weights
 from msgs_slam.pipelines.networks.session import Network, choose_box
 from msgs_slam.pipelines.networks.words import load_linear_head
-from msgs_slam.pipelines.providers import Sequence
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Calibration, Frame, Intrinsics
 from tests.network_labels import network_labels
@@ -253,7 +253,7 @@ def test_weights_beside_the_network_are_found_also_in_subgraphs(tmp_path: Path) 
         ({"valid": [5.0, 1.0]}, "valid"),
         ({"mean": [1.0]}, "three numbers"),
         ({"size": [100_000, 8]}, "size"),
-        ({"multiple": "x"}, "invalid literal"),
+        ({"multiple": "x"}, "expected int"),
         ({"task": "segmentation"}, "needs classes"),
     ],
 )

@@ -14,10 +14,10 @@ from msgs_slam.pipelines.geometry.camera import unproject, unproject_depth
 from msgs_slam.pipelines.proxy.reference import Reference, parse_reference
 from msgs_slam.pipelines.proxy.selection import check_proxy
 from msgs_slam.pipelines.proxy.stage import run
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import FRAMES, PROXY_MAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.tracking.stage import run as track

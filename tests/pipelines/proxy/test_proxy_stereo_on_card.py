@@ -15,7 +15,6 @@ pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip
 
 from test_proxy_stereo import CAMERAS, MATRIX, scene, view_of_plane  # noqa: E402
 
-from msgs_slam.pipelines.compute import gpu  # noqa: E402
 from msgs_slam.pipelines.depth.stereo import cuda, matching  # noqa: E402
 from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths  # noqa: E402
 from msgs_slam.pipelines.depth.stereo.sweep import (  # noqa: E402
@@ -30,6 +29,7 @@ from msgs_slam.pipelines.depth.stereo.volume import (  # noqa: E402
     pick_planes,
     smooth_cost,
 )
+from msgs_slam.pipelines.system import gpu  # noqa: E402
 from tests.card_builds import build  # noqa: E402
 from tests.dense_volumes import of_dense, to_dense  # noqa: E402
 

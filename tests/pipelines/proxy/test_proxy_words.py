@@ -25,8 +25,8 @@ from msgs_slam.pipelines.networks.session import Network
 from msgs_slam.pipelines.networks.words import MAX_WORDS, with_words
 from msgs_slam.pipelines.proxy.selection import check_proxy
 from msgs_slam.pipelines.proxy.stage import run
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.files import CLASSES, PROXY_MAPS
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.types import VOID
 from tests.networks import PICTURE, save_network

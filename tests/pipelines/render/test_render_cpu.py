@@ -6,9 +6,9 @@ import torch
 from render_scenes import IMAGES, NAMES, random_gaussians, room
 from torch import Tensor
 
-from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.render.api import Rendering, composite, moved, project_map, render
+from msgs_slam.pipelines.system.threads import get_threads, set_threads
 from msgs_slam.pipelines.types import Intrinsics
 
 

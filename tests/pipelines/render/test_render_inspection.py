@@ -5,7 +5,6 @@ import reference
 import torch
 from render_scenes import random_gaussians, room
 
-from msgs_slam.pipelines.compute.threads import set_threads
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.render.api import choose_backend, in_view, render
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
@@ -16,6 +15,7 @@ from msgs_slam.pipelines.render.inspection import (
     render_all,
 )
 from msgs_slam.pipelines.render.rules import GaussianStats
+from msgs_slam.pipelines.system.threads import set_threads
 
 POSE = torch.eye(4, dtype=torch.float64)
 

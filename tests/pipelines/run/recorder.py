@@ -1,6 +1,7 @@
 """Small stages for tests of what runs them."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +32,9 @@ class Recorder:
         """Bring a run up to date; which stages ran."""
         self.ran.clear()
         root.mkdir(exist_ok=True)
-        how = config or Config(), SilentProgress(), until, same_source
-        run_stages(list(stages or self.stages()), RunFolder(root), Path("video.mp4"), digest, *how, redo=redo)
+        work = StageContext(RunFolder(root), Path("video.mp4"), config or Config(), root, SilentProgress())
+        work = replace(work, stages=list(stages or self.stages()), same_source=same_source)
+        run_stages(work, digest, until, redo=redo)
         return list(self.ran)
 
     def _make(self, name: str) -> Callable[[StageContext], dict[str, Any]]:

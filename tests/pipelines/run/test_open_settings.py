@@ -11,9 +11,9 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines import reconstruct
 from msgs_slam.pipelines.config import STAGES, Config
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import made_with
-from msgs_slam.pipelines.run.folder import RunFolder, load_settings
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.run.stages import Stage, StageContext
 from msgs_slam.pipelines.system.progress import SilentProgress
 
@@ -63,7 +63,7 @@ def test_a_run_begun_on_a_gpu_goes_on_without_one(
     with_gpu(monkeypatch, False)
     reconstruct.resume(run, SilentProgress())
     assert [device for device, _ in seen] == ["cuda", *["cpu"] * 5]
-    assert load_settings(run).run == made_with(run).run == Config().run
+    assert run.settings().run == made_with(run).run == Config().run
 
 
 def test_the_threads_of_a_cluster_are_not_those_of_the_run(
@@ -73,7 +73,7 @@ def test_the_threads_of_a_cluster_are_not_those_of_the_run(
     reconstruct.reconstruct(source, run, Config(), SilentProgress(), "frames", Three())
     reconstruct.resume(run, SilentProgress(), until="proxy")
     assert seen[0][1] == 3
-    assert load_settings(run).run.threads == 0
+    assert run.settings().run.threads == 0
     reconstruct.resume(run, SilentProgress(), load_config(None, ["run.threads=2"]), workers=Three())
     assert {threads for _, threads in seen[2:]} == {2}
 

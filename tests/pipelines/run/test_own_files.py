@@ -13,9 +13,9 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.tensors import MOST_PACKED, load_arrays, save_arrays
 from msgs_slam.formats.textfile import MAX_JSON_BYTES, read_json
 from msgs_slam.pipelines.config import Config, ExportConfig
-from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_settings
-from msgs_slam.pipelines.run.manifest import Manifest, Source, StageRecord, write_manifest
-from msgs_slam.pipelines.run.reads import Reads
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
+from msgs_slam.pipelines.run.reads import Reads, StageRecord
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 
@@ -27,7 +27,7 @@ def test_a_large_manifest_is_read_again(tmp_path: Path) -> None:
         run.manifest_file, Manifest(Source("v", "d"), {"frames": StageRecord(Reads(), files, 1, 1, {}, [], "c")})
     )
     assert run.manifest_file.stat().st_size > MAX_JSON_BYTES
-    assert load_records(run)["frames"].files == files
+    assert run.records["frames"].files == files
     with pytest.raises(InputError, match="larger than expected"):
         read_json(run.manifest_file)  # as anybody else's
 
@@ -62,7 +62,7 @@ def test_what_is_packed_beyond_measure_is_refused(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("msgs_slam.pipelines.run.manifest.MAX_OWN_JSON_BYTES", 1000)
     (tmp_path / "manifest.json").write_text("[" + " " * 1000 + "]")
     with pytest.raises(InputError, match="larger than expected"):
-        load_records(RunFolder(tmp_path))
+        _ = RunFolder(tmp_path).records
 
 
 @pytest.fixture
@@ -81,13 +81,13 @@ def edit(run: RunFolder, old: str, new: str) -> None:
 
 def test_the_file_may_be_edited(run: RunFolder) -> None:
     edit(run, "voxel = 0.008", "voxel = 0.05  # coarser")
-    assert load_settings(RunFolder(run.root)) == replace(Config(), export=ExportConfig(voxel=0.05))
+    assert RunFolder(run.root).settings() == replace(Config(), export=ExportConfig(voxel=0.05))
 
 
 def test_a_setting_that_is_no_more_does_not_stop_a_run(run: RunFolder, caplog: pytest.LogCaptureFixture) -> None:
     edit(run, "[frames]\n", "[frames]\npeak_threshold = 0.01\nrat = 3\n")
     with caplog.at_level(logging.WARNING):
-        assert load_settings(RunFolder(run.root)) == Config()
+        assert RunFolder(run.root).settings() == Config()
     assert "there is no setting frames.peak_threshold" in caplog.text
     assert "there is no setting frames.rat; did you mean frames.rate?: it is ignored" in caplog.text
 
@@ -97,7 +97,7 @@ def test_a_manifest_of_another_format_is_refused(run: RunFolder) -> None:
     for format in (1, 2, 99):
         run.manifest_file.write_text(json.dumps(value | {"format": format}))
         with pytest.raises(InputError, match=f"its format is {format}, this version of the program knows 3"):
-            load_records(RunFolder(run.root))
+            _ = RunFolder(run.root).records
 
 
 def test_the_working_folder_is_a_run_with_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

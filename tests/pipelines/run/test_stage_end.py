@@ -12,9 +12,9 @@ import pytest
 
 from msgs_slam.formats.errors import DiskFullError
 from msgs_slam.pipelines.config import STAGES, Config
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.run.ending import RECORD, discard, empty
-from msgs_slam.pipelines.run.folder import RunFolder, load_records
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.settings import load_config
 from tests.pipelines.run.recorder import Recorder
 
 CALLS = ("replace", "rename", "unlink", "rmdir", "mkdir", "fsync", "open")
@@ -85,7 +85,7 @@ def test_a_kill_at_any_call_loses_no_finished_stage(finished: tuple[Path, dict[s
         kills += 1
         run = RunFolder(copy)
         ended = any((folder / RECORD).exists() for folder in (run.partial("mapping"), run.stage("mapping")))
-        known = "mapping" in load_records(run)
+        known = "mapping" in run.records
         kept = (run.partial("mapping") / "snapshot" / "half.txt").exists()
         assert ended or known or kept
         ran = bring(copy, config)
@@ -147,7 +147,7 @@ def test_a_disk_that_is_full_for_the_manifest_costs_no_stage(tmp_path: Path, mon
     with pytest.raises(DiskFullError):
         bring(tmp_path / "r", at_end=fill)
     monkeypatch.undo()
-    assert list(load_records(RunFolder(tmp_path / "r"))) == ["frames", "proxy", "tracking"]
+    assert list(RunFolder(tmp_path / "r").records) == ["frames", "proxy", "tracking"]
     assert bring(tmp_path / "r") == []
     assert not list(tmp_path.rglob(RECORD))
 

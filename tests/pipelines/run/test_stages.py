@@ -12,9 +12,9 @@ from msgs_slam.formats.errors import DiskFullError, InputError
 from msgs_slam.formats.reading import note_read
 from msgs_slam.formats.textfile import read_text
 from msgs_slam.pipelines.config import STAGES, Config, MappingConfig
-from msgs_slam.pipelines.read_config import load_config
-from msgs_slam.pipelines.run.folder import RunFolder, load_records, load_stale
+from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.reads import LOGS
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.run.stages import Stage, StageContext
 from tests.pipelines.run.recorder import Recorder
 
@@ -54,8 +54,8 @@ def test_results_of_later_stages_stay_until_their_own_are_ready(recorder: Record
     before = contents(root)
     assert recorder.bring(root, other, until="frames") == ["frames"]
     run = RunFolder(root)
-    assert list(load_records(run)) == ["frames"]
-    assert list(load_stale(run)) == list(STAGES[1:])
+    assert list(run.records) == ["frames"]
+    assert list(run.stale) == list(STAGES[1:])
     later = {k: v for k, v in before.items() if not k.startswith("frames/")}
     assert {k: v for k, v in contents(root).items() if not k.startswith("frames/")} == later
     # What does not belong to these frames is not shown with them.
@@ -68,7 +68,7 @@ def test_results_of_later_stages_stay_until_their_own_are_ready(recorder: Record
     recorder.fail_in = ""
     assert recorder.bring(root, Config()) == ["frames"], "what belongs to the frames of before counts again"
     assert {k: v for k, v in contents(root).items() if not k.startswith("proxy.partial/")} == before
-    assert load_stale(RunFolder(root)) == {}
+    assert RunFolder(root).stale == {}
     assert recorder.bring(root, other) == list(STAGES)
     assert not {k for k, v in contents(root).items() if before.get(k) == v}
     assert not list(root.glob("*.partial"))
@@ -132,7 +132,7 @@ def test_interrupted_stage_keeps_its_snapshot(recorder: Recorder, tmp_path: Path
     with pytest.raises(KeyboardInterrupt):
         recorder.bring(tmp_path / "r")
     run = RunFolder(tmp_path / "r")
-    assert list(load_records(run)) == ["frames", "proxy", "tracking"]
+    assert list(run.records) == ["frames", "proxy", "tracking"]
     assert (run.partial("mapping") / "snapshot" / "half.txt").exists()
     (run.partial("mapping") / ".torn.tmp.npz").write_bytes(b"x")
     recorder.fail_in = ""
@@ -302,7 +302,7 @@ def test_a_stage_can_run_stages_with_the_settings_that_it_is_given(recorder: Rec
     stages = [*recorder.stages()[:-1], Stage("export", run)]
     assert recorder.bring(tmp_path / "r", stages=stages) == within.ran == list(STAGES)
     for folder in (tmp_path / "r", tmp_path / "r" / "within"):
-        assert load_records(RunFolder(folder))["frames"].reads.settings["frames.rate"] == Config().frames.rate
+        assert RunFolder(folder).records["frames"].reads.settings["frames.rate"] == Config().frames.rate
     assert recorder.bring(tmp_path / "r", stages=stages) == []
     other = load_config(overrides=["mapping.hold_out=4"])
     assert recorder.bring(tmp_path / "r", other, stages=stages) == ["mapping", "global_ba", "export"]
@@ -337,5 +337,5 @@ def test_unfinished_work_goes_on_unless_something_that_it_has_read_has_changed(
     log = next((tmp_path / "r" / "frames.partial" / LOGS).iterdir())
     log.write_text(log.read_text() + '["settings", "frames.ra')  # killed in the middle
     assert goes_on("frames.rate=5", "frames.overlap=3")
-    reads = load_records(RunFolder(tmp_path / "r"))["frames"].reads
+    reads = RunFolder(tmp_path / "r").records["frames"].reads
     assert list(reads.files) == [str(tmp_path / "given.txt")], "read before the interruption"

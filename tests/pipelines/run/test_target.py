@@ -12,8 +12,8 @@ from msgs_slam.formats.reading import file_sha256
 from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.run.ending import move_in, results, seal, unseal
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.manifest import Manifest, Source, StageRecord, write_manifest
-from msgs_slam.pipelines.run.reads import Reads
+from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
+from msgs_slam.pipelines.run.reads import Reads, StageRecord
 from msgs_slam.pipelines.run.target import LIST, Target, read_list
 
 

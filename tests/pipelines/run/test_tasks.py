@@ -8,12 +8,11 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from msgs_slam.pipelines.compute.threads import get_threads, set_threads
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.stages import StageContext
-from msgs_slam.pipelines.run.tasks import Chunk, in_chunks, limit_threads
+from msgs_slam.pipelines.run.stages import Chunk, StageContext, in_chunks
 from msgs_slam.pipelines.system.progress import Progress, SilentProgress
+from msgs_slam.pipelines.system.threads import get_threads, limit_threads, set_threads
 from tests.pipelines.travelling import Travelling
 
 

@@ -14,8 +14,8 @@ from msgs_slam.formats.image_folder import list_images
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.geometry.se3 import Similarity
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.scene.gps import georeference
 from msgs_slam.pipelines.scene.world import WORLD
 

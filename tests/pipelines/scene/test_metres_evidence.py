@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.msgs_cli.output import scale_lines
+from msgs_slam.msgs_cli.results import scale_lines
 from msgs_slam.pipelines.run.files import METRES
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.evidence import Evidence, Mode, combine, measured

@@ -17,9 +17,9 @@ from msgs_slam.formats.images import write_rgb
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export.stage import export_run, find_world
 from msgs_slam.pipelines.geometry.se3 import Similarity
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.run.files import MAP
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.scene.world import (
     FIRST,
     WORLD,

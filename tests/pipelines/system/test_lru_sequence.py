@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from msgs_slam.pipelines.compute import threads
-from msgs_slam.pipelines.compute.threads import get_threads
 from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.system import machine as limits
+from msgs_slam.pipelines.system import threads
 from msgs_slam.pipelines.system.machine import available_cpus, machine_memory, memory_room
 from msgs_slam.pipelines.system.parallel import LruSequence
 from msgs_slam.pipelines.system.progress import SilentProgress
+from msgs_slam.pipelines.system.threads import get_threads
 
 
 def test_what_was_used_last_stays_and_the_rest_is_made_again() -> None:

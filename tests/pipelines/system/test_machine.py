@@ -18,11 +18,11 @@ from msgs_slam.pipelines.mapping import growth
 from msgs_slam.pipelines.mapping import stage as mapping_stage
 from msgs_slam.pipelines.mapping.move_map import move_map
 from msgs_slam.pipelines.mapping.state import MapParameters, empty_map
-from msgs_slam.pipelines.outcome import load_outcome
 from msgs_slam.pipelines.reconstruct import all_stages
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.run.files import MAP, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.run.runner import run_stages
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.system.progress import SilentProgress
@@ -51,7 +51,9 @@ def run(device: None, tmp_path_factory: pytest.TempPathFactory, world_sequence: 
         shutil.copyfile(world_sequence / name, source / name)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("msgs_slam.pipelines.global_ba.stage.JOINT_PX", 0.0)
-        records = run_stages(all_stages(), made, source, "made", CONFIG, SilentProgress())
+        records = run_stages(
+            StageContext(made, source, CONFIG, made.root, SilentProgress(), stages=all_stages()), "made"
+        )
     assert list(records) == list(STAGES)
     assert records["tracking"].figures["posed"] == 14
     assert records["mapping"].figures["keyframe_psnr"] > 15

@@ -16,10 +16,10 @@ from msgs_slam.formats.trajectory import OPENCV_FROM_OPENGL
 from msgs_slam.formats.video_streams import write_video
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
-from msgs_slam.pipelines.read_config import load_config
 from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import BACKBONE, FIGURES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.tracking.segments import carry_given, drop_inconsistent_segments, pose_lost
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState

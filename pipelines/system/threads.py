@@ -11,9 +11,8 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..system import jit
-from ..system.machine import available_cpus
-from . import gpu
+from . import gpu, jit
+from .machine import available_cpus
 
 # No "nnan" or "ninf": comparisons with a NaN must stay what they are. "contract" lets a*b+c become one instruction.
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy", "no_cfunc_wrapper": True}
@@ -30,6 +29,23 @@ def set_threads(count: int) -> None:
     if count < 0:
         raise ValueError(f"threads: got {count}, expected >= 0")
     _state["threads"] = count
+
+
+def limit_threads(threads: int) -> None:
+    """Let the libraries of this process use so many CPU threads; 0 leaves it to them."""
+    if threads == 0:
+        return
+    import cv2
+    import scipy.linalg  # noqa: F401 (loads a BLAS of its own, whose threads are limited below)
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    torch.set_num_threads(threads)
+    cv2.setNumThreads(threads)
+    set_threads(threads)
+    # Of numpy's and scipy's BLAS: on more its sums are others, and on the small matrices here they wait for each other
+    # longer than they work, on a busy machine twenty times as long. Threads of ours call it side by side.
+    threadpool_limits(1, "blas")
 
 
 def get_threads() -> int:

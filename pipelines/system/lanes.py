@@ -5,6 +5,7 @@ times slower). Here the vectors are written down: `Lanes` add, multiply and comp
 of a comparison. Everything here can be used in functions compiled by numba only. Array indices are not checked.
 """
 
+import functools
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -118,6 +119,18 @@ _define(operator.and_, mask, lambda b, x, y: b.and_(x, y))
 # --- single values ---------------------------------------------------------------------------------------------------
 
 
+def _on_values(result: types.Type, *arguments: types.Type) -> Callable[[Callable[..., ir.Value]], Any]:
+    """Return a decorator: what emits code for values of these types becomes a function of kernels."""
+
+    def decorate(emit: Callable[..., ir.Value]) -> Any:
+        def typed(typing_context: Any, *given: Any) -> Any:
+            return result(*arguments), lambda context, builder, sig, args: emit(builder, *args)
+
+        return intrinsic(functools.update_wrapper(typed, emit, assigned=("__module__", "__name__", "__doc__")))
+
+    return decorate
+
+
 @intrinsic
 def load(typing_context: Any, array: Any, index: Any) -> Any:
     """array[index : index + 16] as lanes; a flat float32 array."""
@@ -139,74 +152,50 @@ def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
     return types.void(array, types.intp, lanes), emit
 
 
-@intrinsic
-def iota(typing_context: Any, first: Any) -> Any:
+@_on_values(lanes, types.float32)
+def iota(builder: ir.IRBuilder, first: ir.Value) -> ir.Value:
     """first, first + 1, ... first + 15."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        steps = ir.Constant(vector_type(), [float(i) for i in range(WIDTH)])
-        return builder.fadd(splat_lanes(builder, args[0]), steps, flags=FLAGS)
-
-    return lanes(types.float32), emit
+    steps = ir.Constant(vector_type(), [float(i) for i in range(WIDTH)])
+    return builder.fadd(splat_lanes(builder, first), steps, flags=FLAGS)
 
 
-@intrinsic
-def splat(typing_context: Any, value: Any) -> Any:
+@_on_values(lanes, types.float32)
+def splat(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
     """Sixteen times the same number."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return splat_lanes(builder, args[0])
-
-    return lanes(types.float32), emit
+    return splat_lanes(builder, value)
 
 
-@intrinsic
-def where(typing_context: Any, condition: Any, value: Any) -> Any:
+@_on_values(lanes, mask, lanes)
+def where(builder: ir.IRBuilder, condition: ir.Value, value: ir.Value) -> ir.Value:
     """value where the condition holds, else 0."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return builder.select(args[0], args[1], constant(0.0))
-
-    return lanes(mask, lanes), emit
+    return builder.select(condition, value, constant(0.0))
 
 
-@intrinsic
-def min_scalar(typing_context: Any, value: Any, limit: Any) -> Any:
+@_on_values(lanes, lanes, types.float32)
+def min_scalar(builder: ir.IRBuilder, value: ir.Value, limit: ir.Value) -> ir.Value:
     """The smaller of each lane and the limit."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        limits = splat_lanes(builder, args[1])
-        return builder.select(builder.fcmp_ordered("<", args[0], limits), args[0], limits)
-
-    return lanes(lanes, types.float32), emit
+    limits = splat_lanes(builder, limit)
+    return builder.select(builder.fcmp_ordered("<", value, limits), value, limits)
 
 
-@intrinsic
-def reciprocal(typing_context: Any, value: Any) -> Any:
+@_on_values(lanes, lanes)
+def reciprocal(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
     """1 over each lane, for numbers in 2^-60..2^60, relative error below 3e-7; a third of the time of a division.
 
     The difference of a constant and a float's bits has about the bits of the reciprocal; three steps of Newton's.
     """
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        bits = builder.bitcast(args[0], vector_type(element=I32))
-        guess = builder.bitcast(builder.sub(constant(0x7EF311C7, element=I32), bits), vector_type())
-        for _ in range(3):
-            miss = builder.fsub(constant(2.0), builder.fmul(args[0], guess, flags=FLAGS), flags=FLAGS)
-            guess = builder.fmul(guess, miss, flags=FLAGS)
-        return guess
-
-    return lanes(lanes), emit
+    bits = builder.bitcast(value, vector_type(element=I32))
+    guess = builder.bitcast(builder.sub(constant(0x7EF311C7, element=I32), bits), vector_type())
+    for _ in range(3):
+        miss = builder.fsub(constant(2.0), builder.fmul(value, guess, flags=FLAGS), flags=FLAGS)
+        guess = builder.fmul(guess, miss, flags=FLAGS)
+    return guess
 
 
-@intrinsic
-def total(typing_context: Any, value: Any) -> Any:
+@_on_values(types.float32, lanes)
+def total(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
     """Sum of the lanes, always added in the same order."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return fold(builder, args[0], lambda x, y: builder.fadd(x, y, flags=FLAGS))
-
-    return types.float32(lanes), emit
+    return fold(builder, value, lambda x, y: builder.fadd(x, y, flags=FLAGS))
 
 
 @intrinsic
@@ -222,49 +211,29 @@ def add_totals(typing_context: Any, array: Any, index: Any, a: Any, b: Any, c: A
     return types.void(array, types.intp, lanes, lanes, lanes, lanes), emit
 
 
-@intrinsic
-def reduce_max(typing_context: Any, value: Any) -> Any:
+@_on_values(types.float32, lanes)
+def reduce_max(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
     """The largest of the lanes."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return fold(builder, args[0], lambda x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y))
-
-    return types.float32(lanes), emit
+    return fold(builder, value, lambda x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y))
 
 
-@intrinsic
-def maximum(typing_context: Any, value: Any, other: Any) -> Any:
+@_on_values(lanes, lanes, lanes)
+def maximum(builder: ir.IRBuilder, value: ir.Value, other: ir.Value) -> ir.Value:
     """The larger of two numbers, lane by lane."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return builder.select(builder.fcmp_ordered(">", *args), *args)
-
-    return lanes(lanes, lanes), emit
+    return builder.select(builder.fcmp_ordered(">", value, other), value, other)
 
 
-@intrinsic
-def any_lane(typing_context: Any, condition: Any) -> Any:
+@_on_values(types.boolean, mask)
+def any_lane(builder: ir.IRBuilder, condition: ir.Value) -> ir.Value:
     """Whether the condition holds in any lane."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        return builder.icmp_unsigned("!=", builder.bitcast(args[0], ir.IntType(WIDTH)), ir.IntType(WIDTH)(0))
-
-    return types.boolean(mask), emit
+    return builder.icmp_unsigned("!=", builder.bitcast(condition, ir.IntType(WIDTH)), ir.IntType(WIDTH)(0))
 
 
 @intrinsic
 def add_to_box(
-    typing_context: Any,
-    image: Any,
-    image_at: Any,
-    features: Any,
-    features_at: Any,
-    weights: Any,
-    weights_at: Any,
-    rows: Any,
-    columns: Any,
-    vectors: Any,
-) -> Any:
+    typing_context: Any, image: Any, image_at: Any, features: Any, features_at: Any, weights: Any, weights_at: Any,
+    rows: Any, columns: Any, vectors: Any,
+) -> Any:  # fmt: skip
     """image[pixel, :] += weights[pixel] * features for the pixels of a box that starts at the given places.
 
     The box lies in a tile of 16 pixels a row, which keeps 16 numbers a pixel for each element of the tuple `vectors`.
@@ -293,24 +262,20 @@ _EXP2 = (1.0, 0.693147206, 0.240226466, 0.0555032900, 0.00961851953, 0.001339986
 """2^f on [-1/2, 1/2], relative error 2e-9: least squares of the relative error at Chebyshev's nodes."""
 
 
-@intrinsic
-def lane_exp(typing_context: Any, value: Any) -> Any:
+@_on_values(lanes, lanes)
+def lane_exp(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
     """e to each lane, for arguments <= 0 (less than -80 counts as -80); relative error about 1e-7."""
-
-    def emit(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
-        limit = constant(-80.0)
-        argument = builder.select(builder.fcmp_ordered(">", args[0], limit), args[0], limit)
-        power = builder.fmul(argument, constant(1.4426950408889634))
-        whole = call_llvm(builder, f"llvm.rint.v{WIDTH}f32", vector_type(), power)
-        part = builder.fsub(power, whole)
-        result: ir.Value = constant(_EXP2[-1])
-        for coefficient in _EXP2[-2::-1]:
-            result = builder.fadd(builder.fmul(result, part, flags=FLAGS), constant(coefficient), flags=FLAGS)
-        exponent = builder.add(builder.fptosi(whole, vector_type(element=I32)), constant(127, element=I32))
-        scale = builder.bitcast(builder.shl(exponent, constant(23, element=I32)), vector_type())
-        return builder.fmul(result, scale)
-
-    return lanes(lanes), emit
+    limit = constant(-80.0)
+    argument = builder.select(builder.fcmp_ordered(">", value, limit), value, limit)
+    power = builder.fmul(argument, constant(1.4426950408889634))
+    whole = call_llvm(builder, f"llvm.rint.v{WIDTH}f32", vector_type(), power)
+    part = builder.fsub(power, whole)
+    result: ir.Value = constant(_EXP2[-1])
+    for coefficient in _EXP2[-2::-1]:
+        result = builder.fadd(builder.fmul(result, part, flags=FLAGS), constant(coefficient), flags=FLAGS)
+    exponent = builder.add(builder.fptosi(whole, vector_type(element=I32)), constant(127, element=I32))
+    scale = builder.bitcast(builder.shl(exponent, constant(23, element=I32)), vector_type())
+    return builder.fmul(result, scale)
 
 
 def fold(builder: ir.IRBuilder, value: ir.Value, join: Callable[[ir.Value, ir.Value], ir.Value]) -> ir.Value:

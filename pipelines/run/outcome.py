@@ -13,13 +13,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..formats.errors import InputError
-from ..formats.splats import GaussianCloud, isotropic_cloud
-from .config import Config
-from .geometry.se3 import Similarity
-from .geometry.sparse_model import FrameObservations, SparseModel
-from .render.gaussian_map import GaussianMap
-from .run.files import (
+from ...formats.errors import InputError
+from ...formats.splats import GaussianCloud, isotropic_cloud
+from ..config import Config
+from ..geometry.se3 import Similarity
+from ..geometry.sparse_model import FrameObservations, SparseModel
+from ..render.gaussian_map import GaussianMap
+from ..system.machine import resolve_device
+from ..types import VOID, Calibration, ClassTable, Frame, Metres, Trajectory
+from .files import (
     CALIBRATION,
     CLASS_IDS,
     CLASSES,
@@ -34,11 +36,9 @@ from .run.files import (
     SUBMAPS,
     TRAJECTORY,
 )
-from .run.folder import RunFolder, load_records, load_settings, load_source, why_not_done
-from .run.manifest import StageRecord, keyframe_psnr, piece_digest, recorded_config
-from .run.reads import note_figures, watched
-from .system.machine import resolve_device
-from .types import VOID, Calibration, ClassTable, Frame, Metres, Trajectory
+from .folder import RunFolder
+from .manifest import keyframe_psnr, piece_digest, recorded_config
+from .reads import StageRecord, note_figures, watched
 
 T = TypeVar("T")
 _AT_ONCE = 1 << 16
@@ -103,7 +103,7 @@ class Outcome:
     @property
     def source_is_folder(self) -> bool:
         """Whether frames kept the names of the source's images."""
-        source = Path(load_source(self.run).path)
+        source = Path(self.run.source.path)
         return source.is_dir() or (source.suffix == "" and not source.exists())
 
     @property
@@ -119,7 +119,7 @@ class Outcome:
     def require_map(self) -> GaussianMap:
         """The map. Raises InputError before mapping is done."""
         if self.gaussian_map is None:
-            raise InputError(f"{self.run.root}: there is no map yet ({why_not_done(self.run, 'mapping')})")
+            raise InputError(f"{self.run.root}: there is no map yet ({self.run.why_not_done('mapping')})")
         return self.gaussian_map
 
     def load_sparse(self) -> SparseModel | None:
@@ -164,19 +164,19 @@ def runs_of_pieces(run: RunFolder, records: Mapping[str, StageRecord]) -> list[R
         piece
         for name, piece in pieces.items()
         if piece.manifest_file.exists()
-        and "tracking" in load_records(piece)
-        and load_source(piece).digest == piece_digest(records, name)  # not one of an earlier result
+        and "tracking" in piece.records
+        and piece.source.digest == piece_digest(records, name)  # not one of an earlier result
     ]
 
 
 def load_outcome(run: RunFolder, device: str = "auto") -> Outcome:
     """Load the results of a run, its map on `device`. Raises InputError for a run whose tracking is not done."""
-    records = load_records(run)
-    config = watched(recorded_config(records, load_settings(run)))
+    records = run.records
+    config = watched(recorded_config(records, run.settings()))
     note_figures(run.root, records)
     pose_stage = next((s for s in _POSE_STAGES if s in records), "")
     if not pose_stage:
-        raise InputError(f"{run.root}: no camera poses yet ({why_not_done(run, 'tracking')})")
+        raise InputError(f"{run.root}: no camera poses yet ({run.why_not_done('tracking')})")
     trajectory = run.load(TRAJECTORY, pose_stage)
     map_stage = next((s for s in _MAP_STAGES if s in records), "")
     report = run.load(FIGURES["proxy"])

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from msgs_slam.pipelines.compute.adam import AdamTable, descend, gradients_of
+from msgs_slam.pipelines.system.adam import AdamTable, descend, gradients_of
 from tests.plain_adam import plain_descend
 
 

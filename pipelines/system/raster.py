@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.jit import kernel
 from ..types import Array, Intrinsics
+from .jit import kernel
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from dataclasses import Field, fields, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from ..formats.errors import SettingError
-from ..formats.reading import home_expanded, is_unicode
-from ..formats.textfile import read_toml
-from .config import Config, allowed_values, meaning_of, range_text, value_of
+from ...formats.errors import SettingError
+from ...formats.reading import home_expanded, is_unicode
+from ...formats.textfile import read_toml
+from ..config import Config, allowed_values, meaning_of, range_text, value_of
 
 
 class UnknownSettingError(SettingError):

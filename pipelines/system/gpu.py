@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..system.machine import LEAST_CAPABILITY, has_triton
+from .machine import LEAST_CAPABILITY, has_triton
 
 
 def supports_triton(example: Tensor) -> bool:

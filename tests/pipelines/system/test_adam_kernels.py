@@ -11,7 +11,7 @@ if not ON_CARD:
     os.environ["TRITON_INTERPRET"] = "1"  # read when triton is imported and again when the kernels are
 pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip install '.[cuda-check]'")
 
-from msgs_slam.pipelines.compute import adam  # noqa: E402
+from msgs_slam.pipelines.system import adam  # noqa: E402
 from tests.card_builds import build  # noqa: E402
 from tests.plain_adam import plain_descend  # noqa: E402
 
@@ -50,4 +50,4 @@ def test_adams_kernel_takes_the_plain_step(
 def test_adams_kernel_compiles_for_cards(tmp_path: Path) -> None:
     constants = {"BETA1": 0.9, "BETA2": 0.999, "NEW1": 0.1, "NEW2": 0.001, "EPSILON": 1e-15, "BLOCK": 1024}
     kinds = {**dict.fromkeys(("count", "width", "stride"), "i32"), "rows": "*i64", "scale": "fp32", "root": "fp32"}
-    build({"compute.adam_kernels": ["descend_rows"]}, constants | {"CHOSEN": True, "SHARED": True}, kinds, tmp_path)
+    build({"system.adam_kernels": ["descend_rows"]}, constants | {"CHOSEN": True, "SHARED": True}, kinds, tmp_path)
