@@ -21,8 +21,7 @@ class InputError(Exception):
 
 
 class SettingError(InputError):
-    """A setting, or an option that sets one, cannot be what was asked for: exit code 2, as for an option that
-    does not exist."""
+    """A setting cannot be what was asked for: exit code 2, as for an option that does not exist."""
 
 
 class RecoverableError(InputError):

@@ -46,8 +46,7 @@ class Track:
     names: tuple[str, ...] = ()
 
     def at(self, times: Array, farthest: float) -> Array:
-        """Return (N, 3) latitude, longitude, altitude at other times, between fixes; NaN more than `farthest` s from
-        one."""
+        """Return (N, 3) latitude, longitude, altitude between fixes; NaN more than `farthest` seconds from one."""
         around = np.unwrap(self.degrees[:, 1], period=360)  # a track may cross 180 degrees
         values = np.column_stack([self.degrees[:, 0], around, self.altitude])
         out = np.stack([np.interp(times, self.times, column) for column in values.T], axis=1)
@@ -203,15 +202,13 @@ def _seconds(text: str) -> float:
 
 
 def enu_from_geodetic(places: Array, origin: Array) -> Array:
-    """Return (N, 3) latitude, longitude (degrees), altitude -> (N, 3) metres east, north, up of `origin` (3,), on WGS
-    84."""
+    """Return (N, 3) metres east, north, up of `origin` (3,) from (N, 3) latitude, longitude, altitude, on WGS 84."""
     earth = ecef_from_enu(origin)
     return np.asarray((_ecef(places) - earth[:3, 3]) @ earth[:3, :3])
 
 
 def ecef_from_enu(origin: Array) -> Array:
-    """Return (4, 4) from metres east, north, up of `origin` (3,) latitude, longitude, altitude to Earth-centred
-    metres."""
+    """Return (4, 4) from metres east, north, up of `origin` (latitude, longitude, altitude) to Earth-centred ones."""
     lat, lon = np.radians(origin[0]), np.radians(origin[1])
     east = np.array([-np.sin(lon), np.cos(lon), 0.0])
     up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])

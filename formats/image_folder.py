@@ -150,8 +150,7 @@ def _list_in(folder: Path) -> Path | None:
 
 
 def frame_number(path: Path) -> int | None:
-    """Return the last run of digits in a file name without its suffixes (frame-000012.color.jpg: 12), None without
-    one."""
+    """Return the last digits in a file name without its suffixes (frame-000012.color.jpg: 12), None without any."""
     digits = re.findall(r"[0-9]+", path.name.split(".")[0])
     return int(digits[-1]) if digits and len(digits[-1]) <= _MOST_DIGITS else None
 

@@ -136,8 +136,7 @@ def _by_pitch(tags: _Tags, size: tuple[int, int]) -> float | None:
 
 
 def place_of(tags: _Tags) -> tuple[float, float, float] | None:
-    """Return (latitude, longitude, altitude) in degrees and metres of EXIF's GPS tags; altitude NaN, all None where
-    missing."""
+    """Return latitude, longitude (degrees), altitude (m) of EXIF's GPS tags; altitude NaN, all None where missing."""
     angles = []
     for key, negative in ((ExifTags.GPS.GPSLatitude, "S"), (ExifTags.GPS.GPSLongitude, "W")):
         try:

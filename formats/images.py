@@ -47,8 +47,7 @@ _ADVICE = "copy it again or remove it"
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) from the header, after the rotation stated in EXIF. Raises InputError as `read_rgb`
-    does."""
+    """Return (width, height) from the header, after EXIF's rotation. Raises InputError as `read_rgb` does."""
     return read_header(path).size
 
 
@@ -129,8 +128,7 @@ def read_transparent(path: Path, reading: Reading = AS_STATED) -> NDArray[np.boo
 
 
 def read_deep(path: Path) -> NDArray | None:
-    """Read (H, W) or (H, W, 3) values of more than 8 bits as stored; None for other images. Raises as `read_rgb`
-    does."""
+    """Read (H, W) or (H, W, 3) values of more than 8 bits as stored; None for other images. Raises as `read_rgb`."""
     with _opened(Path(path)) as image:
         if _is_deep_colour(image):
             return _decode_16_bits(read_bytes(Path(path)))
@@ -139,8 +137,7 @@ def read_deep(path: Path) -> NDArray | None:
 
 
 def read_depth_png(path: Path) -> NDArray[np.uint16]:
-    """Read (H, W) uint16 depth in the file's own unit. Raises InputError unless the file holds one channel of 16
-    bits."""
+    """Read (H, W) uint16 depth in the file's own unit. Raises InputError for other than one channel of 16 bits."""
     values = _read_one_channel(Path(path), "depth")
     if values.dtype == np.uint8:
         raise InputError(f"{path} has 8 bits a pixel, depth needs 16: was it saved as a preview image?")
@@ -237,15 +234,13 @@ def read_header(path: Path) -> Header:
 
 
 def exif_time(path: Path) -> float | None:
-    """Return the seconds (of the camera's own clock, since 1970) when the image was taken, from EXIF; None when
-    missing."""
+    """Return the seconds since 1970 (on the camera's clock) when it was taken, from EXIF; None when missing."""
     with _opened(Path(path)) as image:
         return tags.time_of(tags.tags_of(image, ExifTags.IFD.Exif))
 
 
 def exif_gps(path: Path) -> tuple[float, float, float] | None:
-    """Return (latitude, longitude, altitude) in degrees and metres that EXIF states; altitude NaN, all None where
-    missing."""
+    """Return latitude, longitude (degrees), altitude (m) that EXIF states; altitude NaN, all None where missing."""
     with _opened(Path(path)) as image:
         return tags.place_of(tags.tags_of(image, ExifTags.IFD.GPSInfo))
 

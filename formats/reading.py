@@ -48,8 +48,7 @@ def on_each_read(call: Callable[[Path], None]) -> Iterator[None]:
 
 @contextmanager
 def noting_files() -> Iterator[list[Path]]:
-    """Yield a list that gets the path of each file that is opened in the block, as for `on_each_read`; nobody else is
-    told of them."""
+    """Yield a list of the files that are opened in the block, which `on_each_read` is not told of."""
     files: list[Path] = []
     token = _noted.set((files.append,))
     try:
@@ -155,8 +154,7 @@ def _require_regular(path: Path, file: BufferedReader, limit: int | None, any_co
 
 
 def require_file(path: Path, limit: int | None = None) -> int:
-    """Return the size in bytes of a file that can be opened, for libraries that open it themselves. Raises as
-    `opened`."""
+    """Return the bytes of a file that can be opened, for libraries that open it themselves. Raises as `opened`."""
     with opened(path, limit) as file:
         return os.fstat(file.fileno()).st_size
 

@@ -113,8 +113,7 @@ def isotropic_cloud(
     colors: NDArray[np.float32],
     class_probs: NDArray[np.float32] | None = None,
 ) -> GaussianCloud:
-    """Return a cloud of balls: log_radii (M,) on all three axes, no rotation, class ids from the largest
-    probability."""
+    """Return a cloud of balls: log_radii (M,) on all axes, no rotation, class ids from the largest probability."""
     if class_probs is not None and not 0 < class_probs.shape[1] <= 255:
         raise ValueError(f"isotropic_cloud: got {class_probs.shape[1]} classes, expected 1 to 255")
     scales, turns = np.repeat(log_radii[:, None], 3, axis=1), np.tile([1, 0, 0, 0], (len(means), 1))

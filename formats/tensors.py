@@ -113,8 +113,7 @@ def save_tensors(path: Path, tensors: Mapping[str, torch.Tensor | NDArray]) -> N
 
 
 def load_tensors(path: Path) -> dict[str, torch.Tensor]:
-    """Return all tensors of a run's .safetensors file, of any size, on the CPU. Raises InputError when it is missing or
-    damaged."""
+    """Return all tensors of a run's .safetensors file, on the CPU. Raises InputError when it is missing or damaged."""
     import safetensors.torch
 
     require_file(path)

@@ -225,8 +225,7 @@ def _integer(digits: str) -> int:
 
 
 def number(table: dict[str, Any], path: Path, *names: str) -> float:
-    """Return the number under the first of these names that is there. Raises InputError when none is, or it is no
-    number."""
+    """Return the number under the first of these names. Raises InputError when none is there, or it is no number."""
     value = optional_number(table, path, *names)
     if value is None:
         raise InputError(f"{path} lacks {' or '.join(repr(n) for n in names)}: add it")

@@ -120,8 +120,7 @@ def mirror_of(matrix: tuple[int, int, int, int]) -> Display:
 
 
 def pixel_aspect(wide: float, high: float) -> float:
-    """Return the width by height of a pixel; 1 where it is not said (0), damaged, or only rounding away from a
-    square."""
+    """Return the width by height of a pixel; 1 where it is not said (0), damaged, or a square but for rounding."""
     aspect = wide / high if wide > 0 and high > 0 else 1.0
     is_square = abs(aspect - 1) < _SQUARE or not 1 / _LONGEST_PIXEL <= aspect <= _LONGEST_PIXEL
     return 1.0 if is_square else aspect
@@ -203,8 +202,7 @@ def _track_of(trak: memoryview, movie_scale: int) -> VideoTrack:
 
 
 def _shown(edits: bytes, movie_scale: int, length: int, scale: int) -> float:
-    """Share of a track's length that its edit list shows, both in its own unit of 1/scale seconds; 1 where that is not
-    said."""
+    """Share of a track's length (in 1/scale seconds) that its edit list shows; 1 where that is not said."""
     row = ">Qq4x" if edits[:1] == b"\1" else ">Ii4x"
     rows = edits[8 : 8 + len(edits[8:]) // struct.calcsize(row) * struct.calcsize(row)]
     parts = [(span, start) for span, start in struct.iter_unpack(row, rows) if span and start >= 0]
@@ -243,8 +241,7 @@ def _metadata_number(data: bytes) -> float | None:
 
 
 def _elements(data: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """Identifier and content of the elements in a content; of one that is cut off, or of unknown length, what is
-    there."""
+    """Identifier and content of the elements; of one that is cut off, or of unknown length, what is there."""
     at = 0
     while at < len(data) and data[at]:
         length = 9 - data[at].bit_length()

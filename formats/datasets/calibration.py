@@ -185,8 +185,7 @@ def _of_colmap(model: str | int, numbers: tuple[float, ...], path: Path) -> Came
 def camera_from_colmap(
     name: str, width: int, height: int, parameters: tuple[float, ...]
 ) -> tuple[Camera | None, tuple[str, ...]]:
-    """Return the camera of a COLMAP model name with its parameters; None and a note where it has no OpenCV
-    equivalent."""
+    """Return the camera of a COLMAP model with its parameters; None and a note where OpenCV has no such lens."""
     if name not in _COLMAP_MODELS:
         return None, (f"COLMAP's camera model {name} is not supported: the model's intrinsics are not used",)
     has_one_focal = name.startswith(("SIMPLE_", "RADIAL"))
@@ -214,8 +213,7 @@ def read_intrinsics_json(path: Path, *, integer_centres: bool) -> tuple[Camera, 
 
 
 def camera_from_table(table: dict[str, Any], path: Path, *, integer_centres: bool) -> Camera:
-    """Return the camera in a table of the keys that `read_intrinsics_json` understands. Raises InputError as that
-    does."""
+    """Return the camera in a table of the keys that `read_intrinsics_json` understands. Raises as that does."""
     said = str(table.get("pixel_centre", "integer" if integer_centres else "half")).lower()
     if not said.startswith(("integer", "half")):
         raise InputError(f"{path}: pixel_centre is {said!r}, expected it to begin with 'integer' or 'half'")

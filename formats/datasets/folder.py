@@ -122,8 +122,7 @@ def _poses(images: list[Path], times: Array | None, root: Path) -> tuple[Array |
 
 
 def sequence_of(format: str, root: Path, images: list[Path], **fields: Any) -> Dataset:
-    """Make the sequence of image files, called as they are, at the times that they state, unless the other `fields` say
-    otherwise."""
+    """Make the sequence of image files, with their names and times unless the other `fields` have them."""
     if "timestamps" not in fields:
         fields["timestamps"] = read_image_times(images)
     names = fields.pop("names", tuple(p.name for p in images))
@@ -211,8 +210,7 @@ def poses_for_images(images: list[Path], poses: Array, source: Path) -> Array:
 
 
 def poses_at(times: Array, pose_times: Array, world_from_cam: Array, tolerance: float = SAME_INSTANT_SECONDS) -> Array:
-    """Return (N, 4, 4) for each of `times` the known pose nearest in time, NaN where none is within `tolerance`
-    seconds."""
+    """Return (N, 4, 4) the known poses nearest to `times`, NaN where none is within `tolerance` seconds."""
     known = np.isfinite(pose_times) & np.isfinite(world_from_cam).all(axis=(1, 2))
     if not known.any():
         return np.full((len(times), 4, 4), np.nan)

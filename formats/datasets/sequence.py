@@ -155,8 +155,7 @@ class Dataset:
         return warp_nearest(depth, self.depth_camera, self.camera)
 
     def labels(self, index: int) -> NDArray[np.uint8] | None:
-        """Return (h, w) uint8 indices into `classes`, VOID_LABEL where the pixel has none of them; None without
-        labels."""
+        """Return (h, w) uint8 indices into `classes`, VOID_LABEL for none of them; None without labels."""
         path = self.label_paths[index] if self.label_paths else None
         if path is None:
             return None

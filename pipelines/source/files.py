@@ -38,8 +38,7 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class Headers:
-    """Headers of the images that can be read, by name; the sizes (width, height) of those that are left out, as most
-    are of another."""
+    """Headers of the images that can be read, by name; sizes (width, height) of those of an odd one, left out."""
 
     of: Mapping[str, Header]
     odd: Mapping[str, Size] = field(default_factory=dict)
@@ -192,8 +191,7 @@ def _require_alike(folder: Path, values: Mapping[str, float], what: str) -> None
 
 
 def video_files(path: Path) -> tuple[Path, ...]:
-    """The videos that a text file of the suffix .videos names, one a line, seen from its folder; of any other file
-    itself."""
+    """The videos that a text file of the suffix .videos names, one a line, from its folder; any other file itself."""
     if path.suffix != _LIST_SUFFIX:
         return (path,)
     lines = [line.strip() for line in read_text(path, _LONGEST_LIST).splitlines()]
