@@ -23,8 +23,8 @@ from ..formats.textfile import write_json
 from ..formats.video import probe_video
 from .config import GPS_AUTO, GPS_OFF, SOURCE_LIST, STAGES, Config
 from .frames.inputs import check_frames, frames_division
-from .mapping.division import mapping_division
 from .proxy.selection import check_proxy, choose_providers
+from .run.files import CALIBRATION, TRAJECTORY
 from .run.folder import RunFolder
 from .run.lock import LOCK, SOFT_LOCK, RunBusyError, locked, make_folder
 from .run.manifest import Source, keyframe_psnr, recorded_config
@@ -35,7 +35,7 @@ from .run.settings import with_absolute_paths
 from .run.stages import Later, Stage, StageContext, TaskWorkers
 from .source.files import require_different
 from .source.recording import open_recording
-from .system.machine import available_cpus, require_device
+from .system.machine import available_cpus, require_device, submap_count, submap_size
 from .system.progress import Progress, log
 from .system.wording import markdown_table, quoted
 
@@ -53,7 +53,7 @@ def all_stages(method: str = "default") -> list[Stage]:
     """The stages of a method (`run.method`) in order. Nothing that computes is imported before a stage runs."""
     between = [
         Stage("tracking", Later("tracking.stage")),
-        Stage("mapping", Later("mapping.stage"), division=mapping_division),
+        Stage("mapping", Later("mapping.stage"), division=_mapping_division),
         Stage("global_ba", Later("global_ba.stage")),
     ]
     if method == "paper":
@@ -65,6 +65,12 @@ def all_stages(method: str = "default") -> list[Stage]:
         *between,
         Stage("export", Later("export.stage"), _check_export),
     ]
+
+
+def _mapping_division(run: RunFolder, config: Config) -> int:
+    """The number of submaps: more for less memory."""
+    kept, _ = run.load(TRAJECTORY, "tracking").split(config.mapping.hold_out)
+    return submap_count(len(kept), submap_size(config, run.load(CALIBRATION).intrinsics))
 
 
 def _check_export(source: Path, config: Config) -> None:

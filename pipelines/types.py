@@ -264,6 +264,26 @@ class Trajectory:
         poses = np.where(self.is_posed[:, None, None], move(self.cam_from_world), self.cam_from_world)
         return replace(self, cam_from_world=poses)
 
+    def of_frames(self, frame_ids: NDArray[np.int64]) -> Trajectory:
+        """Select these frames."""
+        t, rows = self, np.flatnonzero(np.isin(self.frame_ids, frame_ids))
+        reasons = tuple(t.lost_reasons[r] for r in rows)
+        return Trajectory(
+            t.frame_ids[rows],
+            t.timestamps[rows],
+            t.cam_from_world[rows],
+            t.is_keyframe[rows],
+            reasons,
+            t.by_rotation[rows],
+        )
+
+    def split(self, hold_out: int) -> tuple[list[int], list[int]]:
+        """Return the ids of the keyframes to use, and those held out of the placed frames: every `hold_out`-th, from
+        half of that on."""
+        placed, keyframes = (self.frame_ids[rows].tolist() for rows in (self.is_placed, self.is_keyframe))
+        held = [i for i in placed if hold_out > 0 and i % hold_out == hold_out // 2]
+        return [i for i in keyframes if i not in set(held)], held
+
 
 @dataclass(frozen=True)
 class LoopEdge:

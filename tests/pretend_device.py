@@ -17,7 +17,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 from msgs_slam.pipelines.mapping import submap_tasks
-from msgs_slam.pipelines.render import api, cpu, inspection
+from msgs_slam.pipelines.render import api, cpu
 from msgs_slam.pipelines.render.rules import GaussianStats
 from msgs_slam.pipelines.run import outcome, stages
 from msgs_slam.pipelines.system import adam, gpu
@@ -184,7 +184,6 @@ def pretended(patch: pytest.MonkeyPatch) -> Iterator[str]:
         return PretendBackend if isinstance(example, PretendTensor) else right(backend, example)
 
     patch.setattr(api, "choose_backend", choose)
-    patch.setattr(inspection, "choose_backend", choose)
     descend = adam.descend
 
     def step(value: torch.Tensor, *rest: Any) -> None:

@@ -14,7 +14,6 @@ READ_ELSEWHERE = {
     "types.Metres.by_source": "written to scale.json, for people",
     "types.MetresSource": "written to scale.json, for people",
     "evaluation.views.MapView.coverage": "returned by `Run.draw` of the Python interface",
-    "render.inspection.BlendingWeights.largest": "by the kernels that note it in training, which tests compare with it",
 }
 """Classes of pipelines/ or fields of theirs that have their reader outside of the program."""
 Classes = frozenset[str]

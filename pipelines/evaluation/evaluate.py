@@ -12,7 +12,6 @@ from scipy.optimize import least_squares
 from ...formats.datasets import Dataset
 from ...formats.errors import InputError
 from ..geometry import se3
-from ..mapping.division import split_frames
 from ..render.api import Rendering, render
 from ..run.outcome import Outcome, spread_sample
 from ..sfm.lens import FramePixels
@@ -311,7 +310,7 @@ def _jobs(
     outcome: Outcome, matched: MatchedTruth, alignment: AbsoluteError | None, max_views: int
 ) -> list[tuple[int, str, NDArray[np.float64]]]:
     t = outcome.trajectory
-    keyframes, held_out = split_frames(t, outcome.config.mapping.hold_out)
+    keyframes, held_out = t.split(outcome.config.mapping.hold_out)
     used = {*keyframes, *held_out, *t.frame_ids[t.is_keyframe].tolist()}
     between = [i for i in t.frame_ids[t.is_placed].tolist() if i not in used]
     poses = dict(zip(t.frame_ids.tolist(), t.cam_from_world, strict=True))

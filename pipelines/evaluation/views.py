@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ...formats.glb import TexturedMesh
 from ..providers import class_colors
+from ..render.api import render_all
 from ..render.gaussian_map import GaussianMap
-from ..render.inspection import render_all
 from ..run.outcome import Exposure, Outcome, labels_of_channels, spread_sample
 from ..system.raster import draw_faces
 from ..types import VOID, Array, ClassTable, Intrinsics

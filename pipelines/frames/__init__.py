@@ -2,5 +2,5 @@
 
 In goes a source (`source/`), out come undistorted frames with timestamps and what `sfm/` finds of the keyframes. Begin
 with `run` in `stage.py`: `keyframes.py` picks frames and chooses keyframes, `masks.py` leaves out what is no scene,
-`still.py` finds what of it stands still, `tasks.py` features and pairs, `findings.py` what is said of the result.
+`tasks.py` starts structure from motion, `findings.py` holds what is said of the result.
 """

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from bisect import bisect
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +22,7 @@ from ...formats.textfile import read_json, write_json
 from ..config import Config
 from ..geometry.camera import ONE_CAMERA, Rig
 from ..masks.people import PeopleCards, PeopleFinder, people_cards
+from ..masks.still import SAMPLED, find_still
 from ..networks.registry import ModelStore
 from ..run.files import LEFT_OUT
 from ..run.stages import StageContext
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
     from ..sfm.lens import Lens
     from ..source.faces import Faces
 
+_MOST = 0.65
+"""Share of the image beyond which a camera that stands before something that moves is as likely as one that moves."""
 _LITTLE, _LOOKED_AT = 0.05, 40
 """Share of an image that masks leave, in the middle of so many, below which they are the reason where nothing is found.
 """
@@ -160,9 +163,42 @@ class FrameMasks:
         gray = to_grey(read_rgb(self._picked / frame.name))
         return gray, self.left_out(frame, gray.shape[1], gray.shape[0])
 
-    def save_still(self, left_out: NDArray[np.bool_], direction: int) -> None:
-        """Leave out what stands still (h, w), of any size, in all frames of a direction of the rig."""
-        LEFT_OUT.save(self.folder, left_out, _still_name(direction))
+    def leave_out_still(self, context: StageContext, frames: Sequence[Frame]) -> StillShare:
+        """Find what stands still, once, so that it is left out from then on; warn of it.
+
+        Raises InputError where it is most of the image and no poses are known.
+        """
+        if context.config.frames.still == "keep":
+            return StillShare()
+        table = self.folder / "still.json"
+        if not table.exists():
+            write_json(table, asdict(self._find_still(frames, context.progress)))
+        still = StillShare(**read_json(table, None))
+        if still.left_out > _MOST and not context.config.frames.poses:
+            from ..sfm.two_views import HOW_TO_FILM  # imports pycolmap
+
+            raise InputError(
+                f"{_percent(still.left_out)} of the image stands still while the rest moves. If the scene is what "
+                "moves, as on a turntable or in a small part of a screen, leave out all else with --masks FOLDER. "
+                "Otherwise the camera stands still and there is no parallax: "
+                f"{HOW_TO_FILM[0].lower()}{HOW_TO_FILM[1:]}"
+            )
+        for warning in still.warnings:
+            context.warn(warning)
+        return still
+
+    def _find_still(self, frames: Sequence[Frame], progress: Progress) -> StillShare:
+        """What stands still in each direction of the rig, kept in the folder; its share of all."""
+        shares, veils = [], []
+        for direction in range(len(self._rig)):
+            own = [f for f in frames if f.id // self._rig.stations == direction]
+            rows = np.unique(np.linspace(0, len(own) - 1, min(SAMPLED, len(own))).round().astype(int))
+            still = find_still(self.grey(own[i]) for i in progress.track(rows.tolist(), "still parts", len(rows)))
+            if still is not None and still.left_out.any():
+                LEFT_OUT.save(self.folder, still.left_out, _still_name(direction))
+            shares.append(0.0 if still is None else float(still.left_out.mean()))
+            veils.append(0.0 if still is None else still.veil)
+        return StillShare(float(np.mean(shares)), float(np.mean(veils)))
 
     def _still(self, frame: Frame, width: int, height: int) -> NDArray[np.bool_] | None:
         found = LEFT_OUT.find(self.folder, _still_name(frame.id // self._rig.stations))
@@ -305,3 +341,48 @@ def masks_of(context: StageContext, source: Recording, faces: Faces | None, rig:
 
     places = context.snapshot / "left_out", context.snapshot / PICKED
     return FrameMasks(context.config, source, *places, context.threads, faces, rig)
+
+
+@dataclass(frozen=True)
+class StillShare:
+    """Shares of the image: what stands still and is left out, and over what a reflection does, which cannot be."""
+
+    left_out: float = 0.0
+    veil: float = 0.0
+
+    @property
+    def warnings(self) -> list[str]:
+        """Say what was found, and what to do."""
+        said = []
+        if self.left_out:
+            said.append(
+                f"{_percent(self.left_out)} of the image stands still while the rest moves (a bonnet, a display, a "
+                "frame around the view?): it is left out, like what --masks leaves out. To take it for scene: "
+                "--set frames.still=keep"
+            )
+        if self.veil:
+            said.append(
+                f"something translucent, such as a reflection, stands still over {_percent(self.veil)} of the image "
+                "while what is behind it moves: poses and focal length may be wrong. Leave the worst of it out with "
+                "--masks, or film again without a pane, or with the lens close to it"
+            )
+        return said
+
+    @property
+    def note(self) -> str:
+        """Sentence for the end of another message whose cause it may be; "" where nothing was found."""
+        noted = []
+        if self.left_out:
+            noted.append(f"{_percent(self.left_out)} of the image stands still while the rest moves and is left out")
+        if self.veil:
+            noted.append(f"a reflection or the like stands still over {_percent(self.veil)} of the image")
+        return f". Note that {' and '.join(noted)}" if noted else ""
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Figures of the stage."""
+        return {f"still_{name}": round(share, 4) for name, share in asdict(self).items() if share}
+
+
+def _percent(share: float) -> str:
+    return f"{share:.0%}" if share >= 0.01 else f"{share:.1%}"

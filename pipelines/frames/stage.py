@@ -41,9 +41,7 @@ from .findings import (
 from .inputs import require_several
 from .keyframes import KeyframeChoice, choose_keyframes, lossless_image_path, pick_frames, selected_image_path
 from .masks import masks_of
-from .priors import solve
-from .still import leave_out_still
-from .tasks import TASKS, known_camera, structure_from_motion
+from .tasks import TASKS, known_camera, solve, structure_from_motion
 
 _FEW_KEYFRAMES = 12
 _UNSURE_FOCAL = 0.05
@@ -92,7 +90,7 @@ class FramesStage:
         self.given = given_poses(self.config, self.recording, self.frames, context.warn)
         self.rig = rig_of(1 if self.faces is None else len(self.faces), len(self.frames))
         self.masks = masks_of(context, self.recording, self.faces, self.rig)
-        self.still = leave_out_still(context, self.masks, self.frames, self.rig)
+        self.still = self.masks.leave_out_still(context, self.frames)
 
     # structure ----------------------------------------------------------------------------------------------------
 

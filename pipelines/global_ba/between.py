@@ -32,9 +32,8 @@ from ..system.values import load_value, save_value
 from ..system.wording import stretches
 from ..tracking.adjust import settle
 from ..tracking.front_end import FrontEnd
-from ..tracking.pictures import Pictures
 from ..tracking.pnp import FramePose, group_by_points, localise_in_groups, predict_pose
-from ..tracking.state import NO_SIGHTINGS, Sightings, TrackState
+from ..tracking.state import NO_SIGHTINGS, Pictures, Sightings, TrackState
 from ..types import Array, Features, Trajectory, any_of
 
 Image = NDArray[np.uint8]

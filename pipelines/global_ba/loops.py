@@ -64,108 +64,6 @@ def loop_candidates(
 
 
 @dataclass(frozen=True)
-class FoundLoops:
-    """Accepted loops, and how many pairs were rejected at which test."""
-
-    loops: list[Loop]
-    tried: int
-    implausible: int
-    unsupported: int
-
-
-def find_loops(
-    pairs: Iterable[tuple[int, int]],
-    views: Sequence[KeyframeView],
-    cam_from_world: Array,
-    intrinsics: Intrinsics,
-    seed: int,
-) -> FoundLoops:
-    """Verify candidate pairs of keyframe indices; `views`, which may be made on demand, are at
-    cam_from_world (N, 4, 4).
-
-    A verified pair is still refused when the drift it claims is more than the path between its keyframes can have
-    collected, or when no neighbouring pair says the same and it has not many inliers itself: two equal posters on a
-    wall match perfectly, but contradict the path between them.
-    """
-    centres = se3.inverse(cam_from_world)[:, :3, 3]
-    path = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
-    verified: dict[tuple[int, int], Loop] = {}
-    tried = implausible = 0
-    for first, second in pairs:
-        tried += 1
-        loop = verify_loop(views[first], views[second], intrinsics, seed)
-        if loop is None:
-            continue
-        if not is_plausible(loop, views[first], views[second], float(path[second] - path[first])):
-            implausible += 1
-        else:
-            verified[(first, second)] = loop
-    supported = {
-        pair: loop
-        for pair, loop in verified.items()
-        if loop.edge.inliers >= SURE_INLIERS or _has_support(pair, loop, verified, views, intrinsics, seed)
-    }
-    return FoundLoops(list(supported.values()), tried, implausible, len(verified) - len(supported))
-
-
-def claimed_drift(loop: Loop, first: KeyframeView, second: KeyframeView) -> tuple[float, float]:
-    """Return the motion (distance, radians) of the second camera that the loop asks for."""
-    now = second.cam_from_world @ se3.inverse(first.cam_from_world)
-    apart = loop.edge.frame2_from_frame1 @ se3.inverse(now)
-    centre_now, centre_then = se3.inverse(now)[:3, 3], se3.inverse(loop.edge.frame2_from_frame1)[:3, 3]
-    return float(np.linalg.norm(centre_now - centre_then)), float(se3.rotation_angle(apart))
-
-
-def is_plausible(loop: Loop, first: KeyframeView, second: KeyframeView, path: float) -> bool:
-    """Whether a path of that length can have drifted as far as the loop claims."""
-    distance, angle = claimed_drift(loop, first, second)
-    depth = float(np.nanmedian(first.in_cam[:, 2]))
-    scale_drift = abs(np.log(loop.edge.scale))
-    return (
-        distance <= DRIFT * path + TRANSLATION * depth
-        and angle <= np.radians(ANGLE_DRIFT)
-        and scale_drift <= np.log(SCALE_DRIFT)
-    )
-
-
-def _has_support(
-    pair: tuple[int, int],
-    loop: Loop,
-    verified: dict[tuple[int, int], Loop],
-    views: Sequence[KeyframeView],
-    intrinsics: Intrinsics,
-    seed: int,
-) -> bool:
-    """Whether a neighbouring pair is verified too and puts the keyframes in the same places."""
-    first, second = pair
-    near = [(first + a, second + b) for a in (-2, -1, 0, 1, 2) for b in (-2, -1, 0, 1, 2) if (a, b) != (0, 0)]
-    known = [p for p in near if p in verified]
-    fresh = [(first + 1, second), (first, second - 1), (first - 1, second), (first, second + 1)]
-    for other in known + [p for p in fresh if p not in verified and 0 <= p[0] < p[1] < len(views)]:
-        candidate = verified.get(other) or verify_loop(views[other[0]], views[other[1]], intrinsics, seed)
-        if candidate is not None and _agree(loop, pair, candidate, other, views):
-            return True
-    return False
-
-
-def _agree(
-    loop: Loop, pair: tuple[int, int], other: Loop, other_pair: tuple[int, int], views: Sequence[KeyframeView]
-) -> bool:
-    """Carry the other loop over to this pair along the present poses of the neighbours: the same motion?"""
-
-    def relative(target: int, source: int) -> Array:
-        return views[target].cam_from_world @ se3.inverse(views[source].cam_from_world)
-
-    carried = relative(pair[1], other_pair[1]) @ other.edge.frame2_from_frame1 @ relative(other_pair[0], pair[0])
-    apart = carried @ se3.inverse(loop.edge.frame2_from_frame1)
-    depth = float(np.nanmedian(views[pair[1]].in_cam[:, 2]))
-    return bool(
-        se3.rotation_angle(apart) < AGREEMENT * np.radians(ROTATION)
-        and np.linalg.norm(apart[:3, 3]) < AGREEMENT * TRANSLATION * depth
-    )
-
-
-@dataclass(frozen=True)
 class KeyframeView:
     """One keyframe as verification sees it: pose (4, 4), features, the point of each feature (-1 for none), and its
     position in the camera (Q, 3), NaN where neither a point nor a proxy depth gives one."""
@@ -176,14 +74,10 @@ class KeyframeView:
     point: NDArray[np.int64]
     in_cam: Array
 
-
-@dataclass(frozen=True)
-class Loop:
-    """A verified pair: the edge, and the second keyframe's sightings of the first one's points, and vice versa."""
-
-    edge: LoopEdge
-    in_second: Sightings
-    in_first: Sightings
+    @property
+    def depth(self) -> float:
+        """Median depth of the features."""
+        return float(np.nanmedian(self.in_cam[:, 2]))
 
 
 def make_keyframe_view(
@@ -203,54 +97,140 @@ def make_keyframe_view(
     return KeyframeView(frame_id, cam_from_world, features, point, in_cam)
 
 
-def verify_loop(first: KeyframeView, second: KeyframeView, intrinsics: Intrinsics, seed: int) -> Loop | None:
-    """The loop, if both directions find enough inliers, the same motion and a believable scale."""
-    pairs = match_descriptors(first.features.descriptors, second.features.descriptors)
-    forward = _locate(first, pairs[:, 0], second, pairs[:, 1], intrinsics, seed)
-    backward = _locate(second, pairs[:, 1], first, pairs[:, 0], intrinsics, seed)
-    if forward is None or backward is None:
-        return None
-    scale = _relative_scale(first, second, pairs, forward)
-    depth = float(np.nanmedian(second.in_cam[:, 2]))
-    # Backwards the translation comes in the second keyframe's scale.
-    back = se3.inverse(backward.cam_from_world)
-    disagreement = se3.inverse(back) @ se3.scaled(forward.cam_from_world, scale)
-    if not (0.5 < scale < 2.0 and se3.rotation_angle(disagreement) < np.radians(ROTATION)):
-        return None
-    if np.linalg.norm(disagreement[:3, 3]) > TRANSLATION * depth:
-        return None
-    inliers = int(min(forward.inliers.sum(), backward.inliers.sum()))
-    edge = LoopEdge(first.frame_id, second.frame_id, forward.cam_from_world, scale, inliers)
-    agreed = pairs[forward.inliers & backward.inliers]
-    return Loop(
-        edge,
-        _sightings(first, agreed[:, 0], second, agreed[:, 1]),
-        _sightings(second, agreed[:, 1], first, agreed[:, 0]),
+@dataclass(frozen=True)
+class Loop:
+    """A verified pair: the edge, and the second keyframe's sightings of the first one's points, and vice versa."""
+
+    edge: LoopEdge
+    in_second: Sightings
+    in_first: Sightings
+
+
+@dataclass(frozen=True)
+class FoundLoops:
+    """Accepted loops, and how many pairs were rejected at which test."""
+
+    loops: list[Loop]
+    tried: int
+    implausible: int
+    unsupported: int
+
+
+@dataclass(frozen=True)
+class LoopSearch:
+    """Verification of pairs of keyframes, by the indices of their `views`, which may be made on demand."""
+
+    views: Sequence[KeyframeView]
+    cam_from_world: Array
+    intrinsics: Intrinsics
+    seed: int
+
+    def find(self, pairs: Iterable[tuple[int, int]]) -> FoundLoops:
+        """Verify candidate pairs.
+
+        A verified pair is still refused when the drift it claims is more than the path between its keyframes can have
+        collected, or when no neighbouring pair says the same and it has not many inliers itself: two equal posters on a
+        wall match perfectly, but contradict the path between them.
+        """
+        centres = se3.inverse(self.cam_from_world)[:, :3, 3]
+        path = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
+        verified: dict[tuple[int, int], Loop] = {}
+        tried = implausible = 0
+        for pair in pairs:
+            tried += 1
+            loop = self.verify(*pair)
+            if loop is None:
+                continue
+            if self._is_plausible(loop, pair, float(path[pair[1]] - path[pair[0]])):
+                verified[pair] = loop
+            else:
+                implausible += 1
+        supported = [
+            loop
+            for pair, loop in verified.items()
+            if loop.edge.inliers >= SURE_INLIERS or self._has_support(pair, loop, verified)
+        ]
+        return FoundLoops(supported, tried, implausible, len(verified) - len(supported))
+
+    def verify(self, first: int, second: int) -> Loop | None:
+        """The loop, if both directions find enough inliers, the same motion and a believable scale."""
+        one, two = self.views[first], self.views[second]
+        pairs = match_descriptors(one.features.descriptors, two.features.descriptors)
+        forward = self._locate(one, pairs[:, 0], two, pairs[:, 1])
+        backward = self._locate(two, pairs[:, 1], one, pairs[:, 0])
+        if forward is None or backward is None:
+            return None
+        scale = _relative_scale(one, two, pairs, forward)
+        # Backwards the translation comes in the second keyframe's scale.
+        back = se3.inverse(backward.cam_from_world)
+        disagreement = se3.inverse(back) @ se3.scaled(forward.cam_from_world, scale)
+        if not (0.5 < scale < 2.0 and _is_near(disagreement, two.depth)):
+            return None
+        inliers = int(min(forward.inliers.sum(), backward.inliers.sum()))
+        edge = LoopEdge(one.frame_id, two.frame_id, forward.cam_from_world, scale, inliers)
+        agreed = pairs[forward.inliers & backward.inliers]
+        return Loop(
+            edge, _sightings(one, agreed[:, 0], two, agreed[:, 1]), _sightings(two, agreed[:, 1], one, agreed[:, 0])
+        )
+
+    def _locate(
+        self,
+        source: KeyframeView,
+        source_index: NDArray[np.integer],
+        target: KeyframeView,
+        target_index: NDArray[np.integer],
+    ) -> FramePose | None:
+        """target_from_source by PnP, its inliers over all pairs; None when too few agree or they crowd in one spot."""
+        known = np.isfinite(source.in_cam[source_index, 2])
+        if known.sum() < INLIERS:
+            return None
+        xy, camera = target.features.xy[target_index], self.intrinsics
+        solved = solve_pose(xy[known], source.in_cam[source_index[known]], camera, self.seed, None, ERROR, 1.0)
+        if solved is None or solved.inliers.sum() < max(INLIERS, SHARE * known.sum()):
+            return None
+        inliers = np.zeros(len(xy), bool)
+        inliers[known] = solved.inliers
+        spread = xy[inliers].std(0) / np.array([camera.width, camera.height])
+        return FramePose(solved.cam_from_world, inliers) if spread.min() >= 0.06 else None
+
+    def _is_plausible(self, loop: Loop, pair: tuple[int, int], path: float) -> bool:
+        """Whether a path of that length can have drifted as far as the loop claims."""
+        now, then = self._relative(pair[1], pair[0]), loop.edge.frame2_from_frame1
+        distance = float(np.linalg.norm(se3.inverse(now)[:3, 3] - se3.inverse(then)[:3, 3]))
+        return bool(
+            distance <= DRIFT * path + TRANSLATION * self.views[pair[0]].depth
+            and se3.rotation_angle(then @ se3.inverse(now)) <= np.radians(ANGLE_DRIFT)
+            and abs(np.log(loop.edge.scale)) <= np.log(SCALE_DRIFT)
+        )
+
+    def _has_support(self, pair: tuple[int, int], loop: Loop, verified: dict[tuple[int, int], Loop]) -> bool:
+        """Whether a neighbouring pair is verified too and puts the keyframes in the same places."""
+        first, second = pair
+        near = [(first + a, second + b) for a in (-2, -1, 0, 1, 2) for b in (-2, -1, 0, 1, 2) if (a, b) != (0, 0)]
+        known = [p for p in near if p in verified]
+        fresh = [(first + 1, second), (first, second - 1), (first - 1, second), (first, second + 1)]
+        for other in known + [p for p in fresh if p not in verified and 0 <= p[0] < p[1] < len(self.views)]:
+            candidate = verified.get(other) or self.verify(*other)
+            if candidate is not None and self._agree(loop, pair, candidate, other):
+                return True
+        return False
+
+    def _agree(self, loop: Loop, pair: tuple[int, int], other: Loop, other_pair: tuple[int, int]) -> bool:
+        """Carry the other loop over to this pair along the present poses of the neighbours: the same motion?"""
+        before, after = self._relative(other_pair[0], pair[0]), self._relative(pair[1], other_pair[1])
+        carried = after @ other.edge.frame2_from_frame1 @ before
+        return _is_near(carried @ se3.inverse(loop.edge.frame2_from_frame1), self.views[pair[1]].depth, AGREEMENT)
+
+    def _relative(self, target: int, source: int) -> Array:
+        return self.views[target].cam_from_world @ se3.inverse(self.views[source].cam_from_world)
+
+
+def _is_near(apart: Array, depth: float, times: float = 1.0) -> bool:
+    """Whether two motions that are so far apart agree, to so many times the tolerance of one measurement."""
+    return bool(
+        se3.rotation_angle(apart) < times * np.radians(ROTATION)
+        and np.linalg.norm(apart[:3, 3]) < times * TRANSLATION * depth
     )
-
-
-def _locate(
-    source: KeyframeView,
-    source_index: NDArray[np.integer],
-    target: KeyframeView,
-    target_index: NDArray[np.integer],
-    intrinsics: Intrinsics,
-    seed: int,
-) -> FramePose | None:
-    """target_from_source by PnP, its inliers over all pairs; None when too few agree or they crowd in one spot."""
-    known = np.isfinite(source.in_cam[source_index, 2])
-    if known.sum() < INLIERS:
-        return None
-    xy = target.features.xy[target_index]
-    solved = solve_pose(xy[known], source.in_cam[source_index[known]], intrinsics, seed, None, ERROR, 1.0)
-    if solved is None or solved.inliers.sum() < max(INLIERS, SHARE * known.sum()):
-        return None
-    inliers = np.zeros(len(xy), bool)
-    inliers[known] = solved.inliers
-    spread = xy[inliers].std(0) / np.array([intrinsics.width, intrinsics.height])
-    if spread.min() < 0.06:
-        return None
-    return FramePose(solved.cam_from_world, inliers)
 
 
 def _relative_scale(first: KeyframeView, second: KeyframeView, pairs: NDArray[np.integer], forward: FramePose) -> float:

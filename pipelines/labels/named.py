@@ -17,9 +17,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ..geometry.camera import resample_nearest, unproject_depth
-from ..geometry.room_layout import FLOOR, Gravity
 from ..geometry.sequence import Sequence, resample_linear
-from ..geometry.voxels import Voxels, find, find_near, select_voxels, touching, voxel_keys
+from ..geometry.voxels import FLOOR, Gravity, Voxels, find, find_near, select_voxels, touching, voxel_keys
 from ..providers import DepthEstimate, LabelEstimate
 from ..types import Frame
 from .segments import SegmentLabels, cut_parts, cut_patches, label_pixels

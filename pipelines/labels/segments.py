@@ -14,15 +14,20 @@ from numpy.typing import NDArray
 from ...formats.errors import InputError
 from ..depth.completion.fill import domain_transform_in_place
 from ..geometry.camera import resample_nearest, unproject_depth
-from ..geometry.room_layout import NAMES, OTHER, Gravity, find_gravity, floor_plane, name_structure
 from ..geometry.sequence import Sequence
 from ..geometry.voxels import (
     MIN_WEIGHT,
+    NAMES,
+    OTHER,
     VOXELS_PER_DEPTH,
+    Gravity,
     Voxels,
+    find_gravity,
     find_near,
+    floor_plane,
     gather_frame,
     merge,
+    name_structure,
     select_voxels,
     touching,
     voxel_keys,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property, reduce
 
 import cv2
@@ -20,7 +21,6 @@ from ..render.gaussian_map import GaussianMap
 from ..render.rules import GaussianStats
 from ..system.parallel import LruSequence
 from ..types import Intrinsics
-from .schedule import Seeding
 from .state import OptimiserState
 from .views import View
 
@@ -36,22 +36,25 @@ MIN_DETAIL = 8.0
 """Range of colours (of 255) in 3 x 3 pixels below which there is no detail."""
 
 
-@dataclass(frozen=True)
-class SeedDepth:
-    """depth (H, W) float32, 0 = nowhere known; trust (H, W) 0..1."""
+class Seeding(Enum):
+    """Pixels that a step seeds before it renders: none, those of trusted depth, or all remaining holes."""
 
-    depth: NDArray[np.float32]
-    trust: NDArray[np.float32]
+    NOTHING = 0
+    TRUSTED = 1
+    REST = 2
 
 
-def complete_depth(depth: NDArray[np.float32], trust: NDArray[np.float32]) -> SeedDepth:
-    """A depth for every pixel of (H, W), 0 = unknown: what is unknown is filled from around it, and not trusted."""
+def complete_depth(
+    depth: NDArray[np.float32], trust: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """A depth and trust for every pixel of (H, W), 0 = unknown: what is unknown is filled from around it, and not
+    trusted."""
     known = depth > 0
     if not known.any():
-        return SeedDepth(np.zeros_like(depth), np.zeros_like(depth))
+        return np.zeros_like(depth), np.zeros_like(depth)
     inverse, trust = np.divide(1, depth, out=np.zeros_like(depth), where=known), np.where(known, trust, 0)
     filled = np.where(known, inverse, fill_smoothly(inverse, trust))
-    return SeedDepth((1.0 / np.maximum(filled, 1e-9)).astype(np.float32), trust)
+    return (1.0 / np.maximum(filled, 1e-9)).astype(np.float32), trust
 
 
 def fill_smoothly(values: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -223,26 +226,33 @@ class Growth:
         `rendering`: the map as the view sees it, None while there is none.
         """
         view = self.views[index]
-        spacing = self._spacings[index].float()
-        pixels = spacing > 0
-        if rendering is None:
-            completed = self._completed(index)
-        else:
-            pixels &= self._needed(view, rendering) if what is Seeding.TRUSTED else self._holes(rendering)
-            completed = self._completed(index) if what is Seeding.TRUSTED else self._completed_by_map(view, rendering)
-        depth, trust = (torch.from_numpy(x).to(view.image.device) for x in (completed.depth, completed.trust))
+        pixels, depth, trust = self._spacings[index] > 0, view.depth, view.trust
+        if rendering is not None and what is Seeding.TRUSTED:
+            pixels &= self._needed(view, rendering)
+        elif rendering is not None:  # completed from what the other views have put into the map around the holes
+            pixels &= rendering.silhouette < HOLE
+            known = (rendering.silhouette > _SOLID) & (trust < HIGH_RELIABILITY)
+            depth = torch.where(known, rendering.depth, depth)
+            trust = torch.where(known, trust.clamp(min=2 * LOW_RELIABILITY), trust)
+        completed = complete_depth(depth.cpu().numpy(), trust.cpu().numpy())
+        depth, trust = (torch.from_numpy(x).to(view.image.device) for x in completed)
         if what is Seeding.TRUSTED:
             pixels &= trust > LOW_RELIABILITY
-        self._append(index, pixels, depth, trust, spacing, SEED_OPACITY)
+        self._append(index, pixels, depth, trust, SEED_OPACITY)
 
     @torch.no_grad()
     def grow(self, index: int, rendering: Rendering) -> None:
-        """Add Gaussians by the conditions of the paper."""
+        """Add Gaussians by the conditions of the paper, at the proxy's depth where it is reliable, else at the map's
+        own."""
         view = self.views[index]
-        needed = self._needed(view, rendering)
-        spacing = self._spacings[index].float()
-        depth, trust = self._grown_depth(view, rendering)
-        self._append(index, needed & (spacing > 0), depth, trust, spacing, GROWN_OPACITY, weight=1.0)
+        # A trusted proxy is sharp at depth edges, where the map's blended depth lies between the surfaces.
+        nearer = hidden_surfaces(rendering.depth, view.depth, view.trust)
+        use_map = (rendering.silhouette > _SOLID) & ~nearer & (view.trust < HIGH_RELIABILITY)
+        proxy = torch.where(view.trust > LOW_RELIABILITY, view.depth, 0.0)
+        depth = torch.where(use_map, rendering.depth, proxy)
+        trust = torch.where(use_map, LOW_RELIABILITY, view.trust)
+        pixels = self._needed(view, rendering) & (self._spacings[index] > 0)
+        self._append(index, pixels, depth, trust, GROWN_OPACITY, weight=1.0)
 
     @torch.no_grad()
     def note(self, stats: GaussianStats, rows: Tensor | None, footprints: Tensor) -> None:
@@ -290,42 +300,18 @@ class Growth:
         views, stride = self.views, SEED_STRIDE
         return LruSequence(len(views), lambda i: _spacing(views[i], stride), lambda t: t.nbytes, SPACINGS_ROOM)
 
-    def _holes(self, rendering: Rendering) -> Tensor:
-        """Condition (a)."""
-        return holes(rendering.silhouette, HOLE)
-
     def _needed(self, view: View, rendering: Rendering) -> Tensor:
-        """Conditions (a) and (b)."""
-        return self._holes(rendering) | hidden_surfaces(rendering.depth, view.depth, view.trust, DEPTH_TOLERANCE)
-
-    def _grown_depth(self, view: View, rendering: Rendering) -> tuple[Tensor, Tensor]:
-        """(H, W) depth and trust: the proxy where it is reliable, else the map's own; 0 where neither knows."""
-        # A trusted proxy is sharp at depth edges, where the map's blended depth lies between the surfaces.
-        nearer = hidden_surfaces(rendering.depth, view.depth, view.trust, DEPTH_TOLERANCE)
-        use_map = (rendering.silhouette > _SOLID) & ~nearer & (view.trust < HIGH_RELIABILITY)
-        proxy = torch.where(view.trust > LOW_RELIABILITY, view.depth, 0.0)
-        return torch.where(use_map, rendering.depth, proxy), torch.where(use_map, LOW_RELIABILITY, view.trust)
-
-    def _completed(self, index: int) -> SeedDepth:
-        view = self.views[index]
-        return complete_depth(view.depth.cpu().numpy(), view.trust.cpu().numpy())
-
-    def _completed_by_map(self, view: View, rendering: Rendering) -> SeedDepth:
-        """The view's depth, completed from what the other views have put into the map around its holes."""
-        known = (rendering.silhouette > _SOLID) & (view.trust < HIGH_RELIABILITY)
-        trust = torch.where(known, view.trust.clamp(min=2 * LOW_RELIABILITY), view.trust)
-        depth = torch.where(known, rendering.depth, view.depth)
-        return complete_depth(depth.cpu().numpy(), trust.cpu().numpy())
+        """(H, W) conditions (a), the map does not cover the pixel, and (b)."""
+        return (rendering.silhouette < HOLE) | hidden_surfaces(rendering.depth, view.depth, view.trust)
 
     def _append(
-        self, index: int, pixels: Tensor, depth: Tensor, trust: Tensor, spacing: float | Tensor, opacity: float,
-        weight: float = 0.0,
-    ) -> None:  # fmt: skip
+        self, index: int, pixels: Tensor, depth: Tensor, trust: Tensor, opacity: float, weight: float = 0.0
+    ) -> None:
         parameters, view = self.state.parameters, self.views[index]
         pixels = pixels & (depth > 0)
         if not pixels.any() or len(parameters) >= self.settings.max_gaussians:
             return
-        pose = self.state.cam_from_world(index, view)
+        pose, spacing = self.state.cam_from_world(index, view), self._spacings[index].float()
         seeds = seed_gaussians(
             pixels, depth, view.colors, view.channels, spacing, self.classes, pose, view.intrinsics, view.frame_id
         )
@@ -339,17 +325,12 @@ def _spacing(view: View, stride: int) -> Tensor:
     return view.of_scene(torch.from_numpy(spacing).to(view.image.device), 0)
 
 
-def holes(silhouette: Tensor, least: float) -> Tensor:
-    """(H, W) bool: condition (a), the map does not cover the pixel."""
-    return silhouette < least
-
-
-def hidden_surfaces(rendered: Tensor, proxy: Tensor, trust: Tensor, tolerance: float) -> Tensor:
-    """(H, W) bool: condition (b), a trusted proxy is nearer than the map by more than `tolerance` of its depth.
+def hidden_surfaces(rendered: Tensor, proxy: Tensor, trust: Tensor) -> Tensor:
+    """(H, W) bool: condition (b), a trusted proxy is nearer than the map by more than DEPTH_TOLERANCE of its depth.
 
     The less the proxy is trusted, the larger the difference has to be.
     """
-    allowed = tolerance * proxy / trust.clamp(min=0.1)
+    allowed = DEPTH_TOLERANCE * proxy / trust.clamp(min=0.1)
     return (proxy > 0) & (rendered - proxy > allowed)
 
 

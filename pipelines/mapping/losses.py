@@ -1,6 +1,10 @@
-"""Terms of the mapping loss (MSGS-SLAM eqs. 18-20): colour, depth, size and silhouette, scalars without a unit; and the
-exposure of a view, gain and offset of each colour from the map to its photo."""
+"""Loss of the map in one view (MSGS-SLAM eqs. 18-20) and its terms: colour, depth, size and silhouette, scalars without
+a unit; and the exposure of a view, gain and offset of each colour from the map to its photo.
 
+By autograd on the CPU; `cuda_losses` beside this does the same on a GPU in one pass.
+"""
+
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -9,9 +13,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..config import MappingConfig
+from ..render.api import Rendering
 from ..system.lanes import iota, load, splat, store, total, where
 from ..system.ssim import C1, C2, blur_array, ssim_map
-from ..system.threads import for_each, fused_kernel, inner
+from ..system.threads import Floats, for_each, fused_kernel, inner
+from .views import View
 
 SSIM_WEIGHT = 0.2
 """Share of 1 - SSIM in eq. (20)."""
@@ -23,6 +30,24 @@ NU = 1.2
 """ν of eq. (18)."""
 SIZE_LIMIT = 0.03
 """Radius above which a Gaussian is too large, in units of the scene's median depth."""
+SILHOUETTE_WEIGHT = 0.05
+"""Weight (of mean transparency, 0..1) of the pressure towards an opaque map."""
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The terms with their weights; `unit`: the scene's median depth."""
+
+    settings: MappingConfig
+    unit: float
+
+    def of(self, view: View, exposure: Tensor, rendering: Rendering, log_radii: Tensor) -> Tensor:
+        """Scalar; `exposure` (2, 3) is the view's, `log_radii` (M,) those of the Gaussians in view."""
+        loss = photo_loss(rendering.features, exposure, view.image, view.scene)
+        loss = loss + SILHOUETTE_WEIGHT * silhouette_loss(view.of_scene(rendering.silhouette, 1.0))
+        if (weight := self.settings.depth_weight) > 0:
+            loss = loss + weight * depth_loss(rendering.depth, view.depth, depth_weight(view.trust), self.unit)
+        return loss + size_loss(log_radii, self.unit)
 
 
 def depth_weight(reliability: Tensor) -> Tensor:
@@ -75,7 +100,7 @@ def plain_photo_loss(shown: Tensor, exposure: Tensor, photo: Tensor, scene: Tens
 
 
 @lru_cache(maxsize=2)
-def _room(planes: int, size: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _room(planes: int, size: int) -> tuple[Floats, Floats]:
     """Two times `planes` of `size` numbers to work in: fresh pages would take as long as the work does."""
     return np.zeros((planes, size), np.float32), np.zeros((planes, size), np.float32)
 
@@ -132,14 +157,9 @@ class _PhotoLoss(torch.autograd.Function):
 
 @fused_kernel
 def _expose(
-    shown: NDArray[np.float32],
-    photo: NDArray[np.uint8],
-    scene: NDArray[np.bool_] | None,
-    exposure: NDArray[np.float32],
-    start: int,
-    planes: NDArray[np.float32],
-    sums: NDArray[np.float64],
-) -> None:
+    shown: Floats, photo: NDArray[np.uint8], scene: NDArray[np.bool_] | None, exposure: Floats, start: int,
+    planes: Floats, sums: NDArray[np.float64],
+) -> None:  # fmt: skip
     """A band's colours a, photo b and products aa, bb and ab, into the planes from `start` on; the summed |a - b|."""
     height, width, _ = shown.shape
     scale, i = np.float32(1 / 255), start
@@ -160,7 +180,7 @@ def _expose(
 
 @fused_kernel
 def _similarity(
-    band: int, length: int, count: int, moments: NDArray[np.float32], planes: NDArray[np.float32],
+    band: int, length: int, count: int, moments: Floats, planes: Floats,
     sums: NDArray[np.float64],
 ) -> None:  # fmt: skip
     """The derivatives of a band's similarity by mean, variance and covariance, into planes 2 to 4, and its sum.
@@ -188,16 +208,9 @@ def _similarity(
 
 @fused_kernel
 def _differentiate(
-    shown: NDArray[np.float32],
-    photo: NDArray[np.uint8],
-    scene: NDArray[np.bool_] | None,
-    exposure: NDArray[np.float32],
-    start: int,
-    planes: NDArray[np.float32],
-    blurred: NDArray[np.float32],
-    gradient: NDArray[np.float32],
-    sums: NDArray[np.float64],
-) -> None:
+    shown: Floats, photo: NDArray[np.uint8], scene: NDArray[np.bool_] | None, exposure: Floats, start: int,
+    planes: Floats, blurred: Floats, gradient: Floats, sums: NDArray[np.float64],
+) -> None:  # fmt: skip
     """A band's gradient by what was shown."""
     height, width, _ = shown.shape
     size, flat, blurs = planes.shape[1], planes.reshape(-1), blurred.reshape(-1)
@@ -211,7 +224,7 @@ def _differentiate(
 
 
 @inner
-def _gradient_at(planes: NDArray[np.float32], blurred: NDArray[np.float32], i: int, size: int) -> np.float32:
+def _gradient_at(planes: Floats, blurred: Floats, i: int, size: int) -> np.float32:
     """n times the gradient of the loss by one number of the exposed colours.
 
     The window is symmetric and the border zero, so the blur is its own adjoint.

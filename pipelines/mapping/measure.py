@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 
 from ..geometry.posed_depth import PosedDepth
+from ..render.api import render_all
 from ..render.gaussian_map import GaussianMap
-from ..render.inspection import render_all
 from ..system.ssim import ssim_map
 from ..types import VOID, Intrinsics
 from .views import View

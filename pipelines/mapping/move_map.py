@@ -95,15 +95,6 @@ def move_trajectory(
     return replace(trajectory, cam_from_world=moved)
 
 
-def rows_of(trajectory: Trajectory, frame_ids: NDArray[np.int64]) -> Trajectory:
-    """Select these frames of a trajectory."""
-    rows = np.flatnonzero(np.isin(trajectory.frame_ids, frame_ids))
-    t, reasons = trajectory, tuple(trajectory.lost_reasons[r] for r in rows)
-    return Trajectory(
-        t.frame_ids[rows], t.timestamps[rows], t.cam_from_world[rows], t.is_keyframe[rows], reasons, t.by_rotation[rows]
-    )
-
-
 def interpolate_rows(
     wanted: NDArray[np.float64], times: NDArray[np.float64], values: NDArray[np.float32]
 ) -> NDArray[np.float32]:

@@ -20,8 +20,8 @@ from ...formats.tensors import load_arrays, load_tensors, save_arrays, save_tens
 from ..config import Config
 from ..depth.fields import DepthFields
 from ..geometry.posed_depth import PosedDepth
+from ..render.api import blending_weights, median_depth
 from ..render.gaussian_map import GaussianMap
-from ..render.inspection import blending_weights, median_depth
 from ..run.folder import RunFolder
 from ..system.machine import memory_room, resolve_device
 from ..system.progress import Progress
@@ -223,7 +223,7 @@ def measure_submap(task: SubmapTask, progress: Progress) -> tuple[list[ViewFigur
     given = task.views(task.trajectory, task.config.mapping.hold_out)
     rows = {int(i): row for row, i in enumerate(task.trajectory.frame_ids)}
     whole = concatenate(maps)
-    log_gains, offsets = task.exposure or _no_exposure(len(rows))
+    log_gains, offsets = task.exposure or np.zeros((2, len(rows), 3), np.float32)
 
     def figures(view: View) -> ViewFigures:
         row = rows[view.frame_id]
@@ -231,10 +231,6 @@ def measure_submap(task: SubmapTask, progress: Progress) -> tuple[list[ViewFigur
 
     measured = [figures(v) for v in progress.track(given.views, "measuring", len(given.views))]
     return measured, [figures(v) for v in given.held_out]
-
-
-def _no_exposure(count: int) -> Exposures:
-    return np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
 
 
 def _optimise(
@@ -267,7 +263,7 @@ def _depths(result: SubmapResult, intrinsics: Intrinsics) -> NDArray[np.float32]
     """(N, h, w) what the map shows in each of the keyframes."""
     m, camera = result.gaussian_map, intrinsics.at_most(_DEPTH_SIDE)
     poses = (torch.as_tensor(p, device=m.means.device) for p in result.cam_from_world)
-    return np.stack([median_depth(m.means, m.radii, m.opacities, p, camera).cpu().numpy() for p in poses])
+    return np.stack([median_depth(m, p, camera).cpu().numpy() for p in poses])
 
 
 def _posed(results: Iterable[SubmapResult], full: Intrinsics) -> list[PosedDepth]:
@@ -292,7 +288,7 @@ def pixels_filled(gaussian_map: GaussianMap, views: Iterable[View]) -> Tensor:
     m = gaussian_map
     filled = torch.zeros(len(m), device=m.means.device)
     for view in views:
-        filled += blending_weights(m.means, m.radii, m.opacities, view.cam_from_world, view.intrinsics).total
+        filled += blending_weights(m, view.cam_from_world, view.intrinsics)[0]
     return filled
 
 

@@ -12,7 +12,7 @@ from scipy import sparse
 from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
 from ..geometry.posed_depth import PosedDepth
-from .division import submap_count
+from ..system.machine import submap_count
 
 BORDER = 16
 """Keyframes of other submaps that a submap is made with beside its own."""

@@ -22,7 +22,6 @@ from ..run.stages import StageContext
 from ..system.machine import VIEWS_SHARE, room_on
 from ..system.parallel import LruSequence
 from ..types import VOID, Frame, Intrinsics, ProxyMaps, Trajectory
-from .division import split_frames
 
 
 @dataclass(frozen=True)
@@ -142,6 +141,10 @@ def half_view(view: View) -> View:
     def sampled(tensor: Tensor) -> Tensor:
         return tensor[1::2, 1::2][: size[1], : size[0]].contiguous()
 
+    scene = view.scene
+    if scene is not None:  # where all of what a pixel averages is
+        shown = cv2.resize(scene.cpu().numpy().astype(np.float32), size, interpolation=cv2.INTER_AREA) == 1
+        scene = torch.from_numpy(shown).to(scene.device)
     return replace(
         view,
         intrinsics=view.intrinsics.resized(*size),
@@ -150,14 +153,8 @@ def half_view(view: View) -> View:
         reliability=sampled(view.reliability),
         channels=sampled(view.channels),
         channel_confidence=sampled(view.channel_confidence),
-        scene=None if view.scene is None else halved_scene(view.scene, size),
+        scene=scene,
     )
-
-
-def halved_scene(scene: Tensor, size: tuple[int, int]) -> Tensor:
-    """(height, width) of `size` (width, height): scene where all of what a pixel averages is."""
-    shown = cv2.resize(scene.cpu().numpy().astype(np.float32), size, interpolation=cv2.INTER_AREA) == 1
-    return torch.from_numpy(shown).to(scene.device)
 
 
 def occurring_classes(all_labels: Iterable[NDArray[np.uint8]], least_share: float = 1e-5) -> tuple[int, ...]:
@@ -202,7 +199,7 @@ def load_views(
     full = run.load(CALIBRATION).intrinsics
     intrinsics = full.at_most(settings.max_side)
     fields = fields or run.load(DEPTH_FIELDS, "tracking")
-    kept, measured = split_frames(trajectory, settings.hold_out)
+    kept, measured = trajectory.split(settings.hold_out)
     channels = survey(run, kept)[0] if class_ids is None else class_ids
     poses = dict(zip(trajectory.frame_ids.tolist(), trajectory.cam_from_world, strict=True))
 

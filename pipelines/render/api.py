@@ -1,4 +1,5 @@
-"""Drawing a map from a camera: projection (MSGS-SLAM eq. 5) around the compositing of eq. (6)-(9)."""
+"""Drawing a map from a camera: projection (MSGS-SLAM eq. 5) around the compositing of eq. (6)-(9); and looking at one
+without gradients: the depth of surfaces, the classes, how much each Gaussian takes part in an image."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from ..system.machine import has_triton
 from ..system.threads import PART, for_each, fused_kernel
 from ..types import Intrinsics
 from . import rules
+from .gaussian_map import DECIDED_LOGIT, GaussianMap, decided_channels
 from .rules import GaussianStats
 
 Backend: TypeAlias = str | ModuleType | None
@@ -90,7 +92,7 @@ def project_map(
     for name, tensor in (("means", means), ("radii", radii), ("cam_from_world", cam_from_world)):
         require_finite(name, tensor)
     if means.device.type == "cpu" and means.dtype == torch.float32:
-        from .cpu_projection import project  # imports numba
+        from .cpu import project  # imports numba
 
         return project(means, radii, placed_as(cam_from_world, means), intrinsics, near)
     points_in_cam = se3.transform(placed_as(cam_from_world, means), means)
@@ -280,3 +282,128 @@ def _list_in_view(
         out[count] = start + i
         count += (depth > near) & inside
     return out[:count].copy()
+
+
+# looking --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """colors (H, W, 3); depth and silhouette (H, W) as of a `Rendering`; median (H, W) as of `median_depth`; channels
+    (H, W) int16: the class for which most is said, each Gaussian speaking for the strongest of its own as far as it is
+    seen, -1 where nothing decides."""
+
+    colors: Tensor
+    depth: Tensor
+    median: Tensor
+    silhouette: Tensor
+    channels: Tensor
+
+
+@torch.no_grad()
+def median_depth(
+    gaussian_map: GaussianMap, cam_from_world: Tensor, intrinsics: Intrinsics, backend: Backend = None
+) -> Tensor:
+    """(H, W) depth of the Gaussian at which half the light is lost, 0 where it never is: one surface, never a mean of
+    two. No gradients; arguments as in `render`."""
+    return _inspect(gaussian_map, cam_from_world, intrinsics, backend)[1]
+
+
+@torch.no_grad()
+def blending_weights(
+    gaussian_map: GaussianMap,
+    cam_from_world: Tensor,
+    intrinsics: Intrinsics,
+    backend: Backend = None,
+    counts: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Measure what each of the M Gaussians contributes to the image of a camera: its summed and its largest blending
+    weight over all pixels, (M,) each. No gradients; `counts` (H, W): what a pixel's weights count in the sums, None for
+    1; the others as in `render`."""
+    rows, _, *weights = _inspect(gaussian_map, cam_from_world, intrinsics, backend, counts)
+    total, largest = (torch.zeros_like(gaussian_map.log_radii).index_copy(0, rows, w) for w in weights[:2])
+    return total, largest
+
+
+@torch.no_grad()
+def class_weights(
+    gaussian_map: GaussianMap,
+    cam_from_world: Tensor,
+    intrinsics: Intrinsics,
+    channels: Tensor,
+    counts: Tensor,
+    backend: Backend = None,
+) -> tuple[Tensor, Tensor]:
+    """Rows (R,) of the Gaussians in view, and (R, C) what each contributes to the pixels of each class: channels
+    (H, W) uint8, other numbers are no class; counts (H, W). No gradients; the others as in `render`."""
+    m, classes = gaussian_map, gaussian_map.class_logits.shape[1]
+    known = channels < classes
+    if _compiled(backend, m.means) is not None:
+        of_pixels = (torch.where(known, counts, 0.0), torch.where(known, channels, 0))
+        rows, *_, found = _inspect(m, cam_from_world, intrinsics, backend, *of_pixels, classes)
+        return rows, found
+    # A rendering changes with a Gaussian's features by the Gaussian's part in each pixel.
+    pixels, weight = channels.reshape(-1, 1).long(), (counts * known).reshape(-1, 1)
+    given = weight.new_zeros(len(pixels), classes).scatter_(1, pixels.clamp(max=classes - 1), weight)
+    with torch.enable_grad():
+        features = m.means.new_zeros(len(m), classes).requires_grad_()
+        seen = (m.means.detach(), m.radii.detach(), m.opacities.detach(), features)
+        shown = render(*seen, cam_from_world, intrinsics, backend=backend).features
+        found = torch.autograd.grad(shown, features, given.reshape(shown.shape))[0]
+    return torch.arange(len(m), device=m.means.device), found
+
+
+@torch.no_grad()
+def render_all(
+    gaussian_map: GaussianMap, cam_from_world: Tensor, intrinsics: Intrinsics, backend: Backend = None
+) -> Rendered:
+    """Render what a camera at (4, 4) sees of a map, by one walk over it on the CPU. No gradients."""
+    m, camera = gaussian_map, (cam_from_world, intrinsics)
+    classes = m.class_logits.shape[1]
+    if (module := _compiled(backend, m.means)) is not None:
+        m = m.only(in_view(m.means, m.radii, *camera))
+        features = torch.cat([m.colors, *_strongest(m.class_logits)], dim=1)
+        require_finite("features", features)
+        size = (intrinsics.width, intrinsics.height)
+        found = module.render_all(*project_map(m.means, m.radii, *camera), m.opacities, features, classes, *size, NEAR)
+        colors, depth_sum, silhouette, median, strength, channel = found
+        channels = torch.where(strength > DECIDED_LOGIT, channel, -1) if classes else torch.full_like(channel, -1)
+        return Rendered(colors, depth_ratio(depth_sum, silhouette), median, silhouette, channels.to(torch.int16))
+    strength, channel = _strongest(m.class_logits)
+    own = torch.zeros_like(m.class_logits).scatter_(1, channel.long(), strength) if classes else m.class_logits
+    drawn = render(m.means, m.radii, m.opacities, torch.cat([m.colors, own], dim=1), *camera, backend=backend)
+    channels, median = decided_channels(drawn.features[..., 3:]), median_depth(m, *camera, backend)
+    return Rendered(drawn.features[..., :3], drawn.depth, median, drawn.silhouette, channels.to(torch.int16))
+
+
+def _strongest(logits: Tensor) -> tuple[Tensor, Tensor]:
+    """(M, 1) each: the largest of the class logits (M, C), and which that is; zeros without classes."""
+    if logits.shape[1] == 0:
+        return logits.new_zeros(len(logits), 1), logits.new_zeros(len(logits), 1)
+    strength, channel = logits.max(1, keepdim=True)
+    return strength, channel.to(logits)
+
+
+def _compiled(backend: Backend, example: Tensor) -> ModuleType | None:
+    """The compiled CPU backend, where tensors like `example` take it."""
+    if kernels_for(backend, example) is not None:
+        return None
+    module = choose_backend(backend, example)
+    return module if hasattr(module, "render_all") else None
+
+
+def _inspect(
+    gaussian_map: GaussianMap, cam_from_world: Tensor, intrinsics: Intrinsics, backend: Backend, *pixels: Any
+) -> tuple[Tensor, ...]:
+    """Rows (R,) of the Gaussians looked at, and what a backend's `inspect` tells of them, given the `pixels`."""
+    m, size = gaussian_map, (intrinsics.width, intrinsics.height)
+    if (kernels := kernels_for(backend, m.means)) is not None:
+        records = kernels.project(m.means, m.radii, m.opacities, cam_from_world.to(m.means), intrinsics, NEAR)
+        counts = pixels[0] if pixels else None
+        return torch.arange(len(m), device=m.means.device), *kernels.inspect_records(records, *size, counts)
+    radii, opacities = m.radii, m.opacities
+    require_finite("opacities", opacities)
+    rows = in_view(m.means, radii, cam_from_world, intrinsics)
+    means, radii, opacities = (x.index_select(0, rows) for x in (m.means, radii, opacities))
+    projected = project_map(means, radii, cam_from_world, intrinsics)
+    return rows, *choose_backend(backend, m.means).inspect(*projected, opacities, *size, NEAR, *pixels)

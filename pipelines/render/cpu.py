@@ -1,4 +1,5 @@
-"""The renderer on CPUs: one walk over the tiles of each band that draws, looks or weighs, and its autograd operation.
+"""The renderer on CPUs: one walk over the tiles of each band that draws, looks or weighs, and its autograd operation;
+and the projection of world Gaussians to an image (MSGS-SLAM eq. 5), one pass there and one back.
 
 Gaussians are outermost, then the rows of a tile, sixteen pixels of a row at once.
 """
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..system.lanes import add_to_box, load, maximum, reduce_max, splat, store, total, where
-from ..system.threads import as_array, fused_kernel, inlined, inner
+from ..system.threads import PART, Floats, Ints, Longs, as_array, for_each, fused_kernel, inlined, inner
+from ..types import Intrinsics
 from .cpu_backward import pull_back
 from .cpu_bands import (
     PIXELS,
@@ -42,17 +44,9 @@ _ZERO, _HALF, _ONE = F32(0), F32(0.5), F32(1)
 
 
 def composite(
-    u: Tensor,
-    v: Tensor,
-    sigma_px: Tensor,
-    z: Tensor,
-    opacity: Tensor,
-    features: Tensor,
-    width: int,
-    height: int,
-    near: float,
-    stats: GaussianStats | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, features: Tensor, width: int, height: int,
+    near: float, stats: GaussianStats | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Return the feature image (H, W, C), depth sum, depth silhouette and silhouette (H, W) of float32 CPU tensors;
     the backward pass fills the stats."""
     return _Composite.apply(u, v, sigma_px, z, opacity, features, width, height, near, stats)
@@ -88,25 +82,17 @@ class _Composite(torch.autograd.Function):
 
 def inspect(
     u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, width: int, height: int, near: float,
-    counts: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Find the median depth (H, W), and the summed and largest blending weight of each Gaussian, (M,) each; float32 CPU
-    tensors. In the sums a pixel counts as counts (H, W) says, as 1 where None."""
+    counts: Tensor | None = None, channels: Tensor | None = None, classes: int = 0,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Find the median depth (H, W), and of each Gaussian the summed and the largest blending weight, (M,), and the sums
+    by the class of the pixels, (M, classes); float32 CPU tensors. In the sums a pixel counts as counts (H, W) says, as
+    1 where None, for the class of its channel (H, W) uint8."""
     bands = _bands_of((u, v, sigma_px, z, opacity), None, width, height, near)
-    counted = torch.ones(height, width) if counts is None else counts
-    median, found = _weigh(bands, counted, torch.zeros(height, width, dtype=torch.uint8), 0)
-    return median, found[:, 0], found[:, 1]
-
-
-def class_weights(
-    u: Tensor, v: Tensor, sigma_px: Tensor, z: Tensor, opacity: Tensor, near: float, counts: Tensor, channels: Tensor,
-    classes: int,
-) -> Tensor:  # fmt: skip
-    """Sum the blending weights (M, classes) of each Gaussian over the pixels of each of the channels (H, W) uint8; what
-    is no class counts nothing, the others as counts (H, W) says; float32 CPU tensors."""
-    height, width = channels.shape
-    bands, known = _bands_of((u, v, sigma_px, z, opacity), None, width, height, near), channels < classes
-    return _weigh(bands, torch.where(known, counts, 0.0), torch.where(known, channels, 0), classes)[1][:, 2:]
+    counted = torch.ones(height, width) if counts is None else counts.contiguous()
+    of = torch.zeros(height, width, dtype=torch.uint8) if channels is None else channels.contiguous()
+    _, planes, found = draw_bands(bands, width, height, 0, WITH_MEDIAN, classes, (counted.numpy(), of.numpy()))
+    weights = torch.from_numpy(found)
+    return torch.from_numpy(planes[3]), weights[:, 0], weights[:, 1], weights[:, 2:]
 
 
 def render_all(
@@ -128,14 +114,6 @@ def _bands_of(
     return split_into_bands(projected, values, values.shape[1], width, height, near)
 
 
-def _weigh(bands: ImageBands, counts: Tensor, channels: Tensor, classes: int) -> tuple[Tensor, Tensor]:
-    """Median depth (H, W), and of each Gaussian its weights' sum, the largest, and the sums by class, (M, 2 + C)."""
-    height, width = counts.shape
-    pixels = (counts.contiguous().numpy(), channels.contiguous().numpy())
-    _, planes, found = draw_bands(bands, width, height, 0, WITH_MEDIAN, classes, pixels)
-    return torch.from_numpy(planes[3]), torch.from_numpy(found)
-
-
 def draw_bands(
     bands: ImageBands,
     width: int,
@@ -143,8 +121,8 @@ def draw_bands(
     channels: int,
     planes: int = IMAGES,
     classes: int = 0,
-    pixels: tuple[NDArray[np.float32], NDArray[np.uint8]] | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    pixels: tuple[Floats, NDArray[np.uint8]] | None = None,
+) -> tuple[Floats, Floats, Floats]:
     """Walk once over all bands.
 
     Args:
@@ -181,7 +159,7 @@ def draw_bands(
 
 
 @inner
-def open_drawing(job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.float32], tile: tuple[int, ...]) -> None:
+def open_drawing(job: tuple[Any, ...], vectors: Vectors, light: Floats, tile: tuple[int, ...]) -> None:
     """Empty the tile; load what its pixels count and their classes, and whether it shows more than one, or which."""
     image, state, own_class, counted, channels = job[0], job[1], job[5], job[6], job[7]
     left, top, columns, rows = tile
@@ -203,7 +181,7 @@ def open_drawing(job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.float
 
 @inner
 def blend_rows(
-    light: NDArray[np.float32], state: NDArray[np.float32], falloff_y: NDArray[np.float32], first: int, last: int,
+    light: Floats, state: Floats, falloff_y: Floats, first: int, last: int,
     pair: tuple[Any, ...],
 ) -> None:  # fmt: skip
     """Weights of one Gaussian in rows first..last of a tile; light and depth sum go on behind it."""
@@ -219,7 +197,7 @@ def blend_rows(
 
 @inlined
 def paint_image(
-    job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.float32], falloff_y: NDArray[np.float32], i: int,
+    job: tuple[Any, ...], vectors: Vectors, light: Floats, falloff_y: Floats, i: int,
     box: tuple[int, ...], pair: tuple[Any, ...],
 ) -> None:  # fmt: skip
     """Blend one Gaussian into the tile's image."""
@@ -237,7 +215,7 @@ def paint_image(
 
 @inner
 def paint_rows(
-    image: NDArray[np.float32], state: NDArray[np.float32], features: NDArray[np.float32], at: int, first: int,
+    image: Floats, state: Floats, features: Floats, at: int, first: int,
     last: int,
 ) -> None:  # fmt: skip
     """Add three features, those from `at` on, to the three planes of a tile's image, sixteen pixels at once."""
@@ -250,7 +228,7 @@ def paint_rows(
 
 
 @inner
-def note_median(state: NDArray[np.float32], row: int, weight: Any, behind: Any, depth: np.float32) -> None:
+def note_median(state: Floats, row: int, weight: Any, behind: Any, depth: np.float32) -> None:
     """Note the depth of a Gaussian behind which less than half of the light is left, where no nearer one is noted."""
     before = load(state, MEDIAN + row)
     here = (behind < splat(_HALF)) & (weight > splat(_ZERO)) & (before <= splat(_ZERO))
@@ -259,7 +237,7 @@ def note_median(state: NDArray[np.float32], row: int, weight: Any, behind: Any, 
 
 @inlined
 def paint_class(
-    job: tuple[Any, ...], vectors: None, light: NDArray[np.float32], falloff_y: NDArray[np.float32], i: int,
+    job: tuple[Any, ...], vectors: None, light: Floats, falloff_y: Floats, i: int,
     box: tuple[int, ...], pair: tuple[Any, ...],
 ) -> None:  # fmt: skip
     """Blend one Gaussian's colours, and its strength into the plane of its class; note the median depth."""
@@ -276,7 +254,7 @@ def paint_class(
 
 @inlined
 def weigh(
-    job: tuple[Any, ...], vectors: None, light: NDArray[np.float32], falloff_y: NDArray[np.float32], i: int,
+    job: tuple[Any, ...], vectors: None, light: Floats, falloff_y: Floats, i: int,
     box: tuple[int, ...], pair: tuple[Any, ...],
 ) -> None:  # fmt: skip
     """Add one Gaussian's weights in a tile to its row, and note where half of the light is lost in it."""
@@ -300,7 +278,7 @@ def weigh(
 
 
 @inner
-def close_drawing(job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.float32], tile: tuple[int, ...]) -> None:
+def close_drawing(job: tuple[Any, ...], vectors: Vectors, light: Floats, tile: tuple[int, ...]) -> None:
     """Write the tile into the images."""
     image, state, stride, planes, out, classes = job[0], job[1], job[3], job[8], job[9], job[10]
     left, top, columns, rows = tile
@@ -327,25 +305,10 @@ def close_drawing(job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.floa
 
 @inner
 def walk_band(
-    visit: Any,
-    vectors: Vectors,
-    room: int,
-    classes: int,
-    band: int,
-    own: NDArray[np.int32],
-    first: NDArray[np.int32],
-    slots: NDArray[np.int64],
-    records: NDArray[np.float32],
-    features: NDArray[np.float32],
-    tile_starts: NDArray[np.int64],
-    members: NDArray[np.int32],
-    counted: NDArray[np.float32],
-    channels: NDArray[np.uint8],
-    out: NDArray[np.float32],
-    planes: NDArray[np.float32],
-    found: NDArray[np.float32],
-    shared: NDArray[np.float32],
-) -> None:
+    visit: Any, vectors: Vectors, room: int, classes: int, band: int, own: Ints, first: Ints, slots: Longs,
+    records: Floats, features: Floats, tile_starts: Longs, members: Ints, counted: Floats, channels: NDArray[np.uint8],
+    out: Floats, planes: Floats, found: Floats, shared: Floats,
+) -> None:  # fmt: skip
     """Fill the band's rows of the image and the planes, and those of `found` (or of `shared`) of the Gaussians seen in
     it; see `draw_bands`. `room`: numbers a tile keeps of a pixel's channels."""
     height, width = out.shape[:2]
@@ -379,3 +342,97 @@ def paint_class_band(*given: Any) -> None:
 def weigh_band(*given: Any) -> None:
     """Draw median depths, and weigh Gaussians."""
     walk_band(weigh, *given)
+
+
+# projection -------------------------------------------------------------------------------------------------------
+
+
+def project(
+    means: Tensor, radii: Tensor, cam_from_world: Tensor, intrinsics: Intrinsics, near: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """u, v, sigma_px, z (M,) as of `geometry.camera.project_gaussians`, of float32 Gaussians on the CPU seen from
+    cam_from_world (4, 4), float32; differentiable in the first three. The same bytes for any number of threads."""
+    return _Projected.apply(means, radii, cam_from_world, intrinsics, near)
+
+
+class _Projected(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        k, near = arguments[3:]
+        ctx.save_for_backward(*arguments[:3])
+        ctx.camera = np.array([k.fx, k.fy, k.cx, k.cy, (k.fx * k.fy) ** 0.5, near], np.float32)
+        given = [as_array(x) for x in arguments[:3]]
+        out = np.empty((4, len(given[0])), np.float32)
+        for_each(lambda part: _project(part * PART, *given, ctx.camera, out), -(-out.shape[1] // PART))
+        return torch.from_numpy(out).unbind(0)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        means, radii, pose = (as_array(x) for x in ctx.saved_tensors)
+        pull = [as_array(x) for x in gradients]
+        d_means, d_radii, parts = np.empty_like(means), np.empty_like(radii), -(-len(means) // PART)
+        d_pose = np.zeros((parts, 4, 4))
+        for_each(
+            lambda n: _pull_back(n * PART, means, radii, pose, ctx.camera, *pull, d_means, d_radii, d_pose[n]), parts
+        )
+        moved = torch.from_numpy(d_pose.sum(0).astype(np.float32)) if ctx.needs_input_grad[2] else None
+        return torch.from_numpy(d_means), torch.from_numpy(d_radii), moved, None, None
+
+
+@inner
+def _in_camera(pose: Floats, center: Floats) -> tuple[np.float32, np.float32, np.float32]:
+    """The centre (3,) seen from cam_from_world (4, 4)."""
+    a, b, c = center
+    x = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c + pose[0, 3]
+    y = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c + pose[1, 3]
+    z = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2] * c + pose[2, 3]
+    return x, y, z
+
+
+@fused_kernel
+def _project(
+    start: int, means: Floats, radii: Floats, pose: Floats, camera: Floats, out: Floats,
+) -> None:  # fmt: skip
+    """Project one part, from Gaussian `start` on; camera: fx, fy, cx, cy, the mean of the focal lengths, near."""
+    fx, fy, cx, cy, focal, near = camera
+    one = np.float32(1)
+    for i in range(start, min(start + PART, len(means))):
+        x, y, z = _in_camera(pose, means[i])
+        inverse = one / (z if z > near else one)
+        out[0, i] = fx * (x * inverse) + cx
+        out[1, i] = fy * (y * inverse) + cy
+        out[2, i] = focal * (radii[i] * inverse)
+        out[3, i] = z
+
+
+@fused_kernel
+def _pull_back(
+    start: int, means: Floats, radii: Floats, pose: Floats, camera: Floats, pull_u: Floats, pull_v: Floats,
+    pull_sigma: Floats, pull_z: Floats, d_means: Floats, d_radii: Floats, d_pose: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Gradients of one part by those of u, v, sigma_px and z; its share of the pose's is added in float64."""
+    fx, fy, _, _, focal, near = camera
+    one, none = np.float32(1), np.float32(0)
+    for i in range(start, min(start + PART, len(means))):
+        a, b, c = means[i]
+        x, y, z = _in_camera(pose, means[i])
+        inverse = one / (z if z > near else one)
+        by_u, by_v, by_sigma = fx * pull_u[i], fy * pull_v[i], focal * pull_sigma[i]
+        by_inverse = (by_u * x + by_v * y + by_sigma * radii[i]) * inverse * inverse
+        d_radii[i] = by_sigma * inverse
+        d_x, d_y = by_u * inverse, by_v * inverse
+        d_z = pull_z[i] - (by_inverse if z > near else none)
+        for k in range(3):
+            d_means[i, k] = pose[0, k] * d_x + pose[1, k] * d_y + pose[2, k] * d_z
+        d_pose[0, 0] += d_x * a
+        d_pose[0, 1] += d_x * b
+        d_pose[0, 2] += d_x * c
+        d_pose[0, 3] += d_x
+        d_pose[1, 0] += d_y * a
+        d_pose[1, 1] += d_y * b
+        d_pose[1, 2] += d_y * c
+        d_pose[1, 3] += d_y
+        d_pose[2, 0] += d_z * a
+        d_pose[2, 1] += d_z * b
+        d_pose[2, 2] += d_z * c
+        d_pose[2, 3] += d_z

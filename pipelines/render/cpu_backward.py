@@ -8,10 +8,9 @@ d loss / d alpha = light * q - S / (1 - alpha).
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.lanes import add_totals, load, maximum, reciprocal, reduce_max, splat, store, total, where
-from ..system.threads import PART, for_each, fused_kernel, inlined, inner
+from ..system.threads import PART, Floats, Ints, Longs, for_each, fused_kernel, inlined, inner
 from . import rules
 from .cpu_bands import (
     PIXELS,
@@ -40,9 +39,9 @@ _HALF, _ZERO, _ONE = F32(0.5), F32(0), F32(1)
 
 
 def pull_back(
-    bands: ImageBands, features: NDArray[np.float32], planes: NDArray[np.float32], d_features: NDArray[np.float32],
-    d_planes: NDArray[np.float32], marks: NDArray[np.float32] | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+    bands: ImageBands, features: Floats, planes: Floats, d_features: Floats,
+    d_planes: Floats, marks: Floats | None = None,
+) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     """Return the gradients of the Gaussians' u, v, sigma_px, z, opacity (5, M) and of their features (M, C); and (M, 2)
     the largest blending weight of each and the errors of the pixels weighed by it and summed, (0, 2) without marks.
 
@@ -69,7 +68,7 @@ def pull_back(
 
 
 @inner
-def open_gradients(job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.float32], tile: tuple[int, ...]) -> None:
+def open_gradients(job: tuple[Any, ...], vectors: Vectors, light: Floats, tile: tuple[int, ...]) -> None:
     """Load the gradients of the pixels of a tile and everything that will be blended into them."""
     state, image, _, _, features, planes, d_features, d_planes, marks, _ = job
     left, top, columns, rows = tile
@@ -93,7 +92,7 @@ def open_gradients(job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.flo
 
 @inner
 def pull_alpha(
-    state: NDArray[np.float32], light: NDArray[np.float32], row: int, before: Any, alpha: Any, weight: Any,
+    state: Floats, light: Floats, row: int, before: Any, alpha: Any, weight: Any,
     q: Any,
 ) -> Any:  # fmt: skip
     """alpha * d loss / d alpha in a row of pixels; light and what is behind go on behind the Gaussian."""
@@ -106,7 +105,7 @@ def pull_alpha(
 
 @inlined
 def pull_gradients(
-    job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.float32], falloff_y: NDArray[np.float32], i: int,
+    job: tuple[Any, ...], vectors: Vectors, light: Floats, falloff_y: Floats, i: int,
     box: tuple[int, ...], pair: tuple[Any, ...],
 ) -> None:  # fmt: skip
     """Add the gradients of one Gaussian in a tile to its row of d_records, all but those of z and features unscaled.
@@ -169,7 +168,7 @@ def pull_gradients(
 
 
 @inner
-def note(state: NDArray[np.float32], noted: NDArray[np.float32], i: int, first: int, last: int) -> None:
+def note(state: Floats, noted: Floats, i: int, first: int, last: int) -> None:
     """Note a Gaussian's largest weight in rows first..last of a tile, and add what it answers for."""
     most, answered = splat(_ZERO), splat(_ZERO)
     for row in range(TILE * first, TILE * last + TILE, TILE):
@@ -180,32 +179,16 @@ def note(state: NDArray[np.float32], noted: NDArray[np.float32], i: int, first: 
 
 
 @inner
-def close_gradients(job: tuple[Any, ...], vectors: Vectors, light: NDArray[np.float32], tile: tuple[int, ...]) -> None:
+def close_gradients(job: tuple[Any, ...], vectors: Vectors, light: Floats, tile: tuple[int, ...]) -> None:
     """Nothing is left to do in a tile: all is with the Gaussians."""
 
 
 @fused_kernel
 def backward_band(
-    vectors: Vectors,
-    band: int,
-    own: NDArray[np.int32],
-    first: NDArray[np.int32],
-    slots: NDArray[np.int64],
-    records: NDArray[np.float32],
-    padded: NDArray[np.float32],
-    tile_starts: NDArray[np.int64],
-    members: NDArray[np.int32],
-    features: NDArray[np.float32],
-    planes: NDArray[np.float32],
-    d_image: NDArray[np.float32],
-    d_planes: NDArray[np.float32],
-    d_geometry: NDArray[np.float32],
-    d_features: NDArray[np.float32],
-    shared: NDArray[np.float32],
-    marks: NDArray[np.float32],
-    noted: NDArray[np.float32],
-    noted_apart: NDArray[np.float32],
-) -> None:
+    vectors: Vectors, band: int, own: Ints, first: Ints, slots: Longs, records: Floats, padded: Floats,
+    tile_starts: Longs, members: Ints, features: Floats, planes: Floats, d_image: Floats, d_planes: Floats,
+    d_geometry: Floats, d_features: Floats, shared: Floats, marks: Floats, noted: Floats, noted_apart: Floats,
+) -> None:  # fmt: skip
     """Gradients of the Gaussians seen in a band: of u, v, sigma_px, z, opacity to d_geometry (5, M) and of the features
     to d_features (M, C), or, where other bands add to them too, to their row of `shared` (S, 5 + C); likewise `noted`.
 
@@ -248,13 +231,8 @@ def backward_band(
 
 @fused_kernel
 def sum_shared(
-    start: int,
-    rows: int,
-    slots: NDArray[np.int64],
-    shared: NDArray[np.float32],
-    d_geometry: NDArray[np.float32],
-    d_features: NDArray[np.float32],
-) -> None:
+    start: int, rows: int, slots: Longs, shared: Floats, d_geometry: Floats, d_features: Floats,
+) -> None:  # fmt: skip
     """The gradients of the Gaussians in several bands, of `rows` Gaussians from `start` on: the sums of what each of
     the bands has put into their rows of `shared`, always added in the same order."""
     for i in range(start, min(start + rows, len(slots) - 1)):

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..system.lanes import any_lane, iota, lane_exp, load, maximum, min_scalar, splat, store, where
-from ..system.threads import PART, for_each, fused_kernel, inner
+from ..system.threads import PART, Floats, Ints, Longs, for_each, fused_kernel, inner
 from . import rules
 
 F32 = np.float32
@@ -70,34 +69,34 @@ class ImageBands:
     features (`gather_band`) and where its tiles look in them (`list_tiles`).
     """
 
-    first: NDArray[np.int32]
-    starts: NDArray[np.int64]
-    entries: NDArray[np.int32]
-    slots: NDArray[np.int64]
-    prepared: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64], NDArray[np.int32]]]
+    first: Ints
+    starts: Longs
+    entries: Ints
+    slots: Longs
+    prepared: list[tuple[Floats, Floats, Longs, Ints]]
 
     def __len__(self) -> int:
         return len(self.prepared)
 
-    def own(self, band: int) -> NDArray[np.int32]:
+    def own(self, band: int) -> Ints:
         """Indices of the Gaussians of a band, in the order of its records."""
         return self.entries[self.starts[band] : self.starts[band + 1]]
 
     @property
-    def straddling(self) -> NDArray[np.int64]:
+    def straddling(self) -> Longs:
         """Indices of the Gaussians in several bands."""
         return np.flatnonzero(np.diff(self.slots))
 
 
-def for_each_band(task: Callable[[int], None], starts: NDArray[np.int64]) -> None:
+def for_each_band(task: Callable[[int], None], starts: Longs) -> None:
     """Call task(0) .. task(B - 1), those of the most Gaussians first: at the end no thread waits long for another."""
     order = np.argsort(starts[:-1] - starts[1:], kind="stable").tolist()
     for_each(lambda n: task(order[n]), len(order))
 
 
 def split_into_bands(
-    projected: tuple[NDArray[np.float32], ...],
-    features: NDArray[np.float32],
+    projected: tuple[Floats, ...],
+    features: Floats,
     channels: int,
     width: int,
     height: int,
@@ -119,8 +118,8 @@ def split_into_bands(
 
 
 def bin_gaussians(
-    projected: tuple[NDArray[np.float32], ...], width: int, height: int, near: float
-) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
+    projected: tuple[Floats, ...], width: int, height: int, near: float
+) -> tuple[Floats, Ints, Longs, Ints, Longs]:
     """Find how far from its centre each Gaussian is seen, in pixels (M,), 0 where it is not seen at all; and the first
     four fields of `ImageBands`, entries in the order of their indices."""
     count, bands, parts = len(projected[0]), -(-height // BAND_ROWS), -(-len(projected[0]) // PART)
@@ -147,19 +146,9 @@ def bin_gaussians(
 
 @fused_kernel
 def find_bands(
-    u: NDArray[np.float32],
-    v: NDArray[np.float32],
-    sigma_px: NDArray[np.float32],
-    z: NDArray[np.float32],
-    opacity: NDArray[np.float32],
-    width: int,
-    height: int,
-    near: np.float32,
-    reach: NDArray[np.float32],
-    first: NDArray[np.int32],
-    last: NDArray[np.int32],
-    counts: NDArray[np.int64],
-) -> None:
+    u: Floats, v: Floats, sigma_px: Floats, z: Floats, opacity: Floats, width: int, height: int, near: np.float32,
+    reach: Floats, first: Ints, last: Ints, counts: Longs,
+) -> None:  # fmt: skip
     """Fill in `reach`, 0 where it is not seen, and the `first` and `last` band, 0 and -1 there; counts (B,): how many
     are seen in each band. Nothing branches on what is seen, so that loops become vector instructions."""
     right, bottom = F32(width) - _HALF, F32(height) - _HALF
@@ -185,9 +174,7 @@ def find_bands(
 
 
 @fused_kernel
-def list_bands(
-    start: int, first: NDArray[np.int32], last: NDArray[np.int32], places: NDArray[np.int64], entries: NDArray[np.int32]
-) -> None:
+def list_bands(start: int, first: Ints, last: Ints, places: Longs, entries: Ints) -> None:
     """Enter the indices, from `start` on, of Gaussians with a `first` and `last` band into the `entries` of those,
     from the band's own of `places` (B,) on, which move along."""
     for i in range(len(first)):
@@ -196,7 +183,7 @@ def list_bands(
             places[band] += 1
 
 
-def near_to_far(entries: NDArray[np.int32], z: NDArray[np.float32]) -> NDArray[np.int32]:
+def near_to_far(entries: Ints, z: Floats) -> Ints:
     """Sort indices by z > 0, equal depths in the order of their indices.
 
     The bits of positive floats sort as the floats do: with the index behind them all keys differ, and numpy's fastest
@@ -209,16 +196,9 @@ def near_to_far(entries: NDArray[np.int32], z: NDArray[np.float32]) -> NDArray[n
 
 @fused_kernel
 def gather_band(
-    entries: NDArray[np.int32],
-    u: NDArray[np.float32],
-    v: NDArray[np.float32],
-    sigma_px: NDArray[np.float32],
-    z: NDArray[np.float32],
-    opacity: NDArray[np.float32],
-    reach: NDArray[np.float32],
-    features: NDArray[np.float32],
+    entries: Ints, u: Floats, v: Floats, sigma_px: Floats, z: Floats, opacity: Floats, reach: Floats, features: Floats,
     channels: int,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Floats, Floats]:  # fmt: skip
     """Copy the band's Gaussians side by side: records (n * RECORD,) and features padded with 0 to (n * channels,)."""
     records = np.empty(len(entries) * RECORD, np.float32)
     padded = np.zeros(len(entries) * channels, np.float32)
@@ -232,9 +212,7 @@ def gather_band(
 
 
 @fused_kernel
-def list_tiles(
-    records: NDArray[np.float32], top: int, width: int, rows: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+def list_tiles(records: Floats, top: int, width: int, rows: int) -> tuple[Longs, Ints]:
     """List who may touch tile t of a band from row `top`, near to far: members[starts[t]:starts[t + 1]]."""
     count = len(records) // RECORD
     across, down = (width + TILE - 1) // TILE, (rows + TILE - 1) // TILE
@@ -266,7 +244,7 @@ def list_tiles(
 
 
 @inner
-def _tile_starts(boxes: NDArray[np.int32], across: int, down: int) -> NDArray[np.int64]:
+def _tile_starts(boxes: Ints, across: int, down: int) -> Longs:
     """Starts of the tiles' members, row by row, and the end (T + 1,): a box x0, x1, y0, y1 of tiles is counted at its
     corners, which are then summed up along both axes."""
     wide = across + 1
@@ -289,14 +267,14 @@ def _tile_starts(boxes: NDArray[np.int32], across: int, down: int) -> NDArray[np
 
 
 @inner
-def clear(numbers: NDArray[np.float32]) -> None:
+def clear(numbers: Floats) -> None:
     """Fill with zeros. A slice assignment does the same but takes long to compile."""
     for i in range(len(numbers)):
         numbers[i] = _ZERO
 
 
 @inner
-def is_opaque(light: NDArray[np.float32]) -> bool:
+def is_opaque(light: Floats) -> bool:
     """Whether no pixel of the tile takes any more light."""
     most = load(light, 0)
     for y in range(1, TILE):
@@ -305,7 +283,7 @@ def is_opaque(light: NDArray[np.float32]) -> bool:
 
 
 @inner
-def row_opacity(y: int, light: Any, falloff_y: NDArray[np.float32], pair: tuple[Any, ...]) -> Any:
+def row_opacity(y: int, light: Any, falloff_y: Floats, pair: tuple[Any, ...]) -> Any:
     """Return the opacity of a Gaussian in row y of a tile, 0 where it ends or no light arrives; see `walk_tiles`."""
     falloff_x, _, dx2, center, reach2, _ = pair
     dy = F32(y) + _HALF - center
@@ -315,16 +293,9 @@ def row_opacity(y: int, light: Any, falloff_y: NDArray[np.float32], pair: tuple[
 
 @inner
 def walk_tiles(
-    visitors: tuple[Any, ...],
-    job: tuple[Any, ...],
-    kind: Any,
-    band: int,
-    tile_starts: NDArray[np.int64],
-    members: NDArray[np.int32],
-    records: NDArray[np.float32],
-    width: int,
-    height: int,
-) -> None:
+    visitors: tuple[Any, ...], job: tuple[Any, ...], kind: Any, band: int, tile_starts: Longs, members: Ints,
+    records: Floats, width: int, height: int,
+) -> None:  # fmt: skip
     """Walk over the tiles of a band, and over each one's Gaussians near to far, until the tile is opaque.
 
     An isotropic Gaussian is a product of a function of x and one of y: a tile needs two vectors of exponentials for it,

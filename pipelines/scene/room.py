@@ -11,19 +11,25 @@ from numpy.typing import NDArray
 from scipy.ndimage import label as connected
 
 from ..geometry.camera import resize_maps, unproject_depth
-from ..geometry.room_layout import (
+from ..geometry.sequence import resize_area
+from ..geometry.voxels import (
     CEILING,
     FLOOR,
+    MIN_WEIGHT,
+    VOXELS_PER_DEPTH,
     FloorPlane,
     Gravity,
+    Voxels,
+    find,
     find_gravity,
     floor_plane,
+    gather_frame,
     levels,
+    merge,
     name_structure,
+    voxel_keys,
 )
-from ..geometry.room_layout import SURFACE as UNNAMED
-from ..geometry.sequence import resize_area
-from ..geometry.voxels import MIN_WEIGHT, VOXELS_PER_DEPTH, Voxels, find, gather_frame, merge, voxel_keys
+from ..geometry.voxels import SURFACE as UNNAMED
 from ..labels.named import disputed
 from ..types import VOID, Array, Intrinsics, ProxyMaps
 from . import evidence

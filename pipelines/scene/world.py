@@ -14,9 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.posed_depth import PosedDepth
-from ..geometry.room_layout import Gravity, find_gravity, floor_plane, name_structure
 from ..geometry.se3 import Similarity
-from ..geometry.voxels import VOXELS_PER_DEPTH, Voxels, gather_depths
+from ..geometry.voxels import (
+    VOXELS_PER_DEPTH,
+    Gravity,
+    Voxels,
+    find_gravity,
+    floor_plane,
+    gather_depths,
+    name_structure,
+)
 from ..mapping.measure import depth_view
 from ..run.outcome import Outcome, maps_around, spread_sample
 from ..run.schema import RunFile

@@ -57,6 +57,11 @@ def submap_size(config: Config, camera: Intrinsics) -> int:
     return min(limit, max(MIN_SUBMAP, int(room / (a_million_gaussians * _GAUSSIANS / 1e6 * pixels))))
 
 
+def submap_count(keyframes: int, size: int) -> int:
+    """Return into how many submaps of about that size so many keyframes are divided; one for a size of 0."""
+    return max(1, round(keyframes / size)) if size else 1
+
+
 def release_free_memory() -> None:
     """Hand what is free back to the system, where the C library has a call for that: glibc keeps what is between
     pieces still in use, after a window of structure from motion 40 to 190 MB."""

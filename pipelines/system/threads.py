@@ -4,7 +4,7 @@ import itertools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numba.extending import register_jitable
@@ -16,6 +16,10 @@ from .machine import available_cpus
 
 # No "nnan" or "ninf": comparisons with a NaN must stay what they are. "contract" lets a*b+c become one instruction.
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy", "no_cfunc_wrapper": True}
+
+Floats: TypeAlias = NDArray[np.float32]
+Ints: TypeAlias = NDArray[np.int32]
+Longs: TypeAlias = NDArray[np.int64]
 
 PART = 16384
 """Gaussians that a thread takes at a time."""

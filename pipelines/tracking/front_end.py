@@ -15,9 +15,8 @@ from ..sfm.adjust import FEATURE_SD
 from ..sfm.flow import FLOW_SD, find_corners, follow
 from ..sfm.matching import match_descriptors
 from ..types import Array, Intrinsics
-from .pictures import Pictures
 from .pnp import MAX_GAP, MIN_INLIERS, POSE_ERROR, FramePose, predict_pose, relocalise, solve_pose
-from .state import NO_SIGHTINGS, Sightings, TrackState
+from .state import NO_SIGHTINGS, Pictures, Sightings, TrackState
 
 NEW_POINTS = 300
 """Points that a new keyframe should have."""
@@ -101,21 +100,15 @@ class FrontEnd:
             return
         share = len(self.state.sightings[frame_id]) / max(len(self.state.sightings[nearest[0]]), 1)
         if share < KEYFRAME_SHARE:
-            promote(frame_id, self.state, self.pictures)
+            self.promote(frame_id)
 
     def extend_before(self, frame_id: int) -> bool:
         """Make the posed frame next to this one a keyframe, where there is none ahead; whether that was possible."""
         near = [i for i in (frame_id - 1, frame_id + 1) if i in self.state.poses and i not in self.state.keyframes]
         if not near or self.is_inside(frame_id):
             return False
-        promote(near[0], self.state, self.pictures)
+        self.promote(near[0])
         return True
-
-    def _start(self, frame_id: int, start: Array | None) -> bool:
-        if self.is_rig:
-            return False
-        pose = np.eye(4) if start is None else start
-        return start_segment(frame_id, pose, self.state, self.pictures)
 
     def correspond(self, frame_id: int, start: Array, keyframes: list[int]) -> Sightings:
         """Points of the keyframes found in the frame by KLT, searched from where `start` (4, 4) puts them."""
@@ -139,6 +132,76 @@ class FrontEnd:
     def is_trusted(self, seen: Sightings, solved: FramePose | None) -> bool:
         """Enough points agree, and not by a small minority, which is how a wrong pose looks."""
         return _count(solved) >= MIN_INLIERS and _count(solved) >= 0.4 * len(seen)
+
+    def promote(self, frame_id: int) -> None:
+        """Make a posed frame a keyframe with new points."""
+        state = self.state
+        earlier = [k for k in state.nearest_keyframes(frame_id, 2) if state.segment[k] == state.segment[frame_id]]
+        state.keyframes = sorted({*state.keyframes, frame_id})
+        if earlier:
+            self._triangulate(earlier[0], frame_id)
+        self._add_from_proxy(frame_id)
+
+    def _start(self, frame_id: int, start: Array | None) -> bool:
+        """Begin anew from one frame's proxy depth; return False, with nothing changed, when it has too few points for
+        that."""
+        state = self.state
+        if self.is_rig or self.pictures.proxy(frame_id) is None:
+            return False
+        before, segment = len(state.points), max(state.segment.values(), default=-1) + 1
+        state.add_frame(frame_id, np.eye(4) if start is None else start, NO_SIGHTINGS, True, segment)
+        if self._add_from_proxy(frame_id) >= MIN_INLIERS:
+            return True
+        state.remove_frame(frame_id)
+        state.points, state.colors = state.points[:before], state.colors[:before]
+        return False
+
+    def _add_from_proxy(self, frame_id: int) -> int:
+        """Add corners that are no points yet, at the proxy depth, scaled to agree with the points the frame sees; how
+        many there are."""
+        pictures, maps = self.pictures, self.pictures.proxy(frame_id)
+        if maps is None:
+            return 0
+        seen, intrinsics = self.state.sightings[frame_id], pictures.intrinsics
+        count = max(NEW_POINTS - len(seen), 0)
+        xy = find_corners(pictures.grey(frame_id), seen.xy, count, left_out=pictures.left_out(frame_id))
+        depth, _ = sample_proxy(maps, xy, intrinsics)
+        scale = scale_at_points(maps, seen.xy, self.state.depths(frame_id), intrinsics, MIN_INLIERS) or 1.0
+        good = depth > 0
+        self._add(unproject(xy[good], depth[good] * scale, intrinsics), {frame_id: xy[good]})
+        return int(good.sum())
+
+    def _triangulate(self, first: int, second: int) -> None:
+        """Add corners of the first keyframe that are no points yet, followed into the second."""
+        state, pictures, intrinsics = self.state, self.pictures, self.pictures.intrinsics
+        grey = pictures.grey(first)
+        xy = find_corners(grey, state.sightings[first].xy, NEW_POINTS, left_out=pictures.left_out(first))
+        motion = state.poses[second] @ se3.inverse(state.poses[first])
+        guess, _ = project(se3.transform(motion, unproject(xy, self._nearby_depth(first, xy), intrinsics)), intrinsics)
+        there, found = follow(grey, pictures.grey(second), xy, guess)
+        found &= pictures.is_scene(second, there)
+        xy, there = xy[found], there[found]
+        in_first, good = triangulate(xy, there, motion, intrinsics, POSE_ERROR)
+        self._add(in_first[good], {first: xy[good], second: there[good]})
+
+    def _nearby_depth(self, frame_id: int, xy: Array) -> Array:
+        """(Q,) depth of the nearest known point in the image: a fair first guess."""
+        seen, z = self.state.sightings[frame_id], self.state.depths(frame_id)
+        ahead = z > 0
+        if not ahead.any() or len(xy) == 0:
+            return np.ones(len(xy))
+        distance = ((xy[:, None] - seen.xy[ahead][None]) ** 2).sum(2)
+        return z[ahead][distance.argmin(1)]
+
+    def _add(self, in_cam: Array, seen_at: dict[int, Array]) -> None:
+        """Add points (Q, 3) in the first keyframe, found by it at pixels (Q, 2) and followed into the others."""
+        (first, xy), state = next(iter(seen_at.items())), self.state
+        points = se3.transform(se3.inverse(state.poses[first]), in_cam)
+        index = state.add_points(points, self.pictures.color(first)[xy[:, 1].astype(int), xy[:, 0].astype(int)])
+        for frame_id, pixels in seen_at.items():
+            is_first = frame_id == first
+            extra = Sightings.of(index, pixels, FEATURE_SD if is_first else FLOW_SD, -1 if is_first else first)
+            state.sightings[frame_id] = state.sightings[frame_id].joined(extra)
 
 
 def _count(solved: FramePose | None) -> int:
@@ -235,75 +298,6 @@ def _rays(xy: Array, camera: Intrinsics) -> Array:
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def promote(frame_id: int, state: TrackState, pictures: Pictures) -> int:
-    """Make a posed frame a keyframe with new points; returns how many are new."""
-    earlier = [k for k in state.nearest_keyframes(frame_id, 2) if state.segment[k] == state.segment[frame_id]]
-    state.keyframes = sorted({*state.keyframes, frame_id})
-    added = 0
-    if earlier:
-        added += _triangulate(earlier[0], frame_id, state, pictures)
-    return added + _from_proxy(frame_id, state, pictures)
-
-
-def start_segment(frame_id: int, cam_from_world: Array, state: TrackState, pictures: Pictures) -> bool:
-    """Begin anew from one frame's proxy depth; return False, with nothing changed, when it has too few points for
-    that."""
-    if pictures.proxy(frame_id) is None:
-        return False
-    before = len(state.points)
-    segment = max(state.segment.values(), default=-1) + 1
-    state.add_frame(frame_id, cam_from_world, NO_SIGHTINGS, True, segment)
-    if _from_proxy(frame_id, state, pictures) >= MIN_INLIERS:
-        return True
-    state.remove_frame(frame_id)
-    state.points, state.colors = state.points[:before], state.colors[:before]
-    return False
-
-
-def _from_proxy(frame_id: int, state: TrackState, pictures: Pictures) -> int:
-    """Corners that are no points yet, at the proxy depth, scaled to agree with the points the frame sees."""
-    maps = pictures.proxy(frame_id)
-    if maps is None:
-        return 0
-    seen, intrinsics = state.sightings[frame_id], pictures.intrinsics
-    count = max(NEW_POINTS - len(seen), 0)
-    xy = find_corners(pictures.grey(frame_id), seen.xy, count, left_out=pictures.left_out(frame_id))
-    depth, _ = sample_proxy(maps, xy, intrinsics)
-    scale = scale_at_points(maps, seen.xy, state.depths(frame_id), intrinsics, MIN_INLIERS) or 1.0
-    good = depth > 0
-    in_cam = unproject(xy[good], depth[good] * scale, intrinsics)
-    points = se3.transform(se3.inverse(state.poses[frame_id]), in_cam)
-    _add(points, {frame_id: xy[good]}, state, pictures)
-    return int(good.sum())
-
-
-def _triangulate(first: int, second: int, state: TrackState, pictures: Pictures) -> int:
-    """Corners of the first keyframe that are no points yet, followed into the second."""
-    taken, intrinsics = state.sightings[first].xy, pictures.intrinsics
-    grey = pictures.grey(first)
-    xy = find_corners(grey, taken, NEW_POINTS, left_out=pictures.left_out(first))
-    motion = state.poses[second] @ se3.inverse(state.poses[first])
-    depth = _nearby_depth(first, xy, state)
-    guess, _ = project(se3.transform(motion, unproject(xy, depth, intrinsics)), intrinsics)
-    there, found = follow(grey, pictures.grey(second), xy, guess)
-    found &= pictures.is_scene(second, there)
-    xy, there = xy[found], there[found]
-    in_first, good = triangulate(xy, there, motion, intrinsics, POSE_ERROR)
-    points = se3.transform(se3.inverse(state.poses[first]), in_first[good])
-    _add(points, {first: xy[good], second: there[good]}, state, pictures)
-    return int(good.sum())
-
-
-def _nearby_depth(frame_id: int, xy: Array, state: TrackState) -> Array:
-    """(Q,) depth of the nearest known point in the image: a fair first guess."""
-    seen, z = state.sightings[frame_id], state.depths(frame_id)
-    ahead = z > 0
-    if not ahead.any() or len(xy) == 0:
-        return np.ones(len(xy))
-    distance = ((xy[:, None] - seen.xy[ahead][None]) ** 2).sum(2)
-    return z[ahead][distance.argmin(1)]
-
-
 def triangulate(
     xy1: Array, xy2: Array, cam2_from_cam1: Array, intrinsics: Intrinsics, max_error: float
 ) -> tuple[Array, NDArray[np.bool_]]:
@@ -323,14 +317,3 @@ def triangulate(
         seen, _ = project(se3.transform(motion, points), intrinsics)
         good &= np.nan_to_num(np.linalg.norm(seen - xy, axis=1), nan=np.inf) < max_error
     return points, good
-
-
-def _add(points: Array, seen_at: dict[int, Array], state: TrackState, pictures: Pictures) -> None:
-    """Add points (Q, 3), found by the first keyframe at pixels (Q, 2) and followed into the others."""
-    first, xy = next(iter(seen_at.items()))
-    colors = pictures.color(first)[xy[:, 1].astype(int), xy[:, 0].astype(int)]
-    index = state.add_points(points, colors)
-    for frame_id, pixels in seen_at.items():
-        is_first = frame_id == first
-        extra = Sightings.of(index, pixels, FEATURE_SD if is_first else FLOW_SD, -1 if is_first else first)
-        state.sightings[frame_id] = state.sightings[frame_id].joined(extra)

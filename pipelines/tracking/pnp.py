@@ -12,8 +12,7 @@ from ..geometry import se3
 from ..sfm.bundle import adjust_pose, reprojection_errors
 from ..sfm.matching import match_descriptors
 from ..types import Array, Intrinsics
-from .pictures import Pictures
-from .state import NO_SIGHTINGS, Sightings, TrackState
+from .state import NO_SIGHTINGS, Pictures, Sightings, TrackState
 
 CANDIDATES = 6
 """Similar keyframes in which a lost frame is looked for."""

@@ -15,9 +15,8 @@ from ..run.stages import StageContext
 from ..sfm.given import fit_given_poses
 from ..system.wording import stretches
 from ..types import Array, GivenPoses
-from .pictures import Pictures
 from .pnp import MIN_INLIERS, group_by_points, localise_in_groups
-from .state import NO_SIGHTINGS, Sightings, TrackState
+from .state import NO_SIGHTINGS, Pictures, Sightings, TrackState
 
 _MAX_SCALE_SD = 0.1
 """Relative: over a stretch about as short as their own errors, given poses do not determine the scale."""

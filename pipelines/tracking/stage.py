@@ -28,11 +28,12 @@ from ..system.wording import stretches
 from ..types import Frame
 from .adjust import Report, adjust_state, align_depths, drop_loose, has_independent_depth
 from .front_end import FrontEnd, set_rotation_only_poses
-from .pictures import Pictures, load_shutter
 from .pnp import MAX_GAP
 from .segments import carry_given, join_segments, split_segments
 from .state import (
+    Pictures,
     TrackState,
+    load_shutter,
     sparse_model_of,
     split_worlds,
     sync_rig_poses,

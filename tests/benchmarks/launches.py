@@ -37,11 +37,10 @@ from torch.utils._pytree import tree_flatten
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.depth.stereo import cuda as stereo_cuda
 from msgs_slam.pipelines.depth.stereo.matching import StereoImages
-from msgs_slam.pipelines.mapping.optimise import MapOptimiser
-from msgs_slam.pipelines.mapping.schedule import Step
+from msgs_slam.pipelines.mapping.optimise import MapOptimiser, Step
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View, make_view
-from msgs_slam.pipelines.render import api, cuda, inspection
+from msgs_slam.pipelines.render import api, cuda
 from msgs_slam.pipelines.render.gaussian_map import GaussianMap
 from msgs_slam.pipelines.system import gpu
 from msgs_slam.pipelines.types import Intrinsics, ProxyMaps
@@ -161,8 +160,7 @@ def as_on_a_card(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(gpu, "launch", partial(_launch, None))
     for number in ("TILE", "STEP_BACK"):  # the interpreter takes as long for a small step as for a large one
         patch.setattr(cuda, number, 16)
-    for user in (api, inspection):
-        patch.setattr(user, "choose_backend", backend)
+    patch.setattr(api, "choose_backend", backend)
 
 
 def made_views(generator: np.random.Generator) -> list[View]:

@@ -20,7 +20,7 @@ sys.path.insert(0, str(ROOT))
 import numpy as np
 
 from msgs_slam.pipelines.config import MappingConfig
-from msgs_slam.pipelines.mapping import schedule
+from msgs_slam.pipelines.mapping import optimise
 from msgs_slam.pipelines.mapping.measure import mean_figures, measure_view
 from msgs_slam.pipelines.mapping.optimise import optimise_map
 from msgs_slam.pipelines.mapping.views import MappingInput, load_views
@@ -39,19 +39,19 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 def trial(given: MappingInput, change: dict[str, Any]) -> dict[str, float]:
     """Figures of the map with one change, which is undone again."""
-    kept = (schedule.TIME_DECAY, schedule.RELIABILITY_DECAY, schedule.Schedule._covisible, schedule.overlaps)
+    kept = (optimise.TIME_DECAY, optimise.RELIABILITY_DECAY, optimise.Schedule._covisible, optimise.overlaps)
     settings = MappingConfig(passes=4.0, min_iterations=0)
     try:
         for name in ("TIME_DECAY", "RELIABILITY_DECAY"):
-            setattr(schedule, name, change.get(name, getattr(schedule, name)))
+            setattr(optimise, name, change.get(name, getattr(optimise, name)))
         if "_covisible" in change:
-            schedule.Schedule._covisible = change["_covisible"]  # type: ignore[method-assign]
+            optimise.Schedule._covisible = change["_covisible"]  # type: ignore[method-assign]
         if limit := change.get("t_geo", 0.0):
-            schedule.overlaps = lambda views: np.where((o := kept[3](views)) > limit, o, 0.0)
+            optimise.overlaps = lambda views: np.where((o := kept[3](views)) > limit, o, 0.0)
         result = optimise_map(given.views, len(given.class_ids), settings, change.get("seed", 0))
     finally:
-        schedule.TIME_DECAY, schedule.RELIABILITY_DECAY = kept[:2]
-        schedule.Schedule._covisible, schedule.overlaps = kept[2:]  # type: ignore[method-assign]
+        optimise.TIME_DECAY, optimise.RELIABILITY_DECAY = kept[:2]
+        optimise.Schedule._covisible, optimise.overlaps = kept[2:]  # type: ignore[method-assign]
     rows = zip(given.views, result.cam_from_world, result.log_gains, result.offsets, strict=True)
     nothing = np.zeros(3, np.float32)
     held = [measure_view(result.gaussian_map, v, v.cam_from_world.numpy(), nothing, nothing) for v in given.held_out]

@@ -34,9 +34,19 @@ from msgs_slam.pipelines.export.texture import simplified, texels_wanted
 from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
 from msgs_slam.pipelines.geometry.camera import resize_maps
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth, neighbours, overlaps
-from msgs_slam.pipelines.geometry.room_layout import Gravity, find_gravity, floor_plane, levels, name_structure
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.geometry.voxels import Voxels, find_near, gather_depths, touching, voxel_keys
+from msgs_slam.pipelines.geometry.voxels import (
+    Gravity,
+    Voxels,
+    find_gravity,
+    find_near,
+    floor_plane,
+    gather_depths,
+    levels,
+    name_structure,
+    touching,
+    voxel_keys,
+)
 from msgs_slam.pipelines.mapping.growth import complete_depth, fill_smoothly, seed_spacing
 from msgs_slam.pipelines.mapping.losses import depth_loss, fit_exposure
 from msgs_slam.pipelines.mapping.measure import depth_view, mesh_view

@@ -14,8 +14,8 @@ from msgs_slam.pipelines.depth.stereo.consistency import fuse_depths
 from msgs_slam.pipelines.depth.stereo.sweep import refine_inverse_depth, sweep_cost
 from msgs_slam.pipelines.depth.stereo.volume import Bands, smooth_cost
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.mapping.losses import expose, fit_exposure
-from msgs_slam.pipelines.mapping.objective import Objective, color_errors_on_card, fit_exposure_on_card
+from msgs_slam.pipelines.mapping.cuda_losses import card_loss, color_errors_on_card, fit_exposure_on_card
+from msgs_slam.pipelines.mapping.losses import Objective, expose, fit_exposure
 from msgs_slam.pipelines.mapping.state import KEYS
 from msgs_slam.pipelines.render.api import Rendering, composite, in_view, project_map, render
 from msgs_slam.pipelines.system.adam import descend
@@ -159,11 +159,12 @@ def _loss(rows: Rows) -> None:
     for place, kind in ((CARD, torch.float32), (CPU, torch.float64)):
         given = (features, depth, silhouette, radii)
         leaves = [x.to(place.device, kind, copy=True).requires_grad_() for x in given]
-        seen = marks.to(place.device) if place.kernels else None
-        sizes = leaves[3] if place.kernels else leaves[3][marks]
         with place.used():
-            drawn, told = Rendering(*leaves[:3]), exposure.to(place.device, kind)
-            value = objective.of(there(view, place), told, drawn, sizes, seen)
+            seen = (there(view, place), exposure.to(place.device, kind), Rendering(*leaves[:3]))
+            if place.kernels:
+                value = card_loss(objective, *seen, leaves[3], marks.to(place.device))
+            else:
+                value = objective.of(*seen, leaves[3][marks])
             found.append([value, *torch.autograd.grad(value, leaves)])
     for of, ours, exact in zip(("value", "d colours", "d depth", "d silhouette", "d radii"), *found, strict=True):
         agree(rows, "loss", of, ours, exact)

@@ -18,8 +18,7 @@ from torch import Tensor
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.depth.stereo.matching import StereoImages
 from msgs_slam.pipelines.depth.stereo.sweep import warps_to
-from msgs_slam.pipelines.mapping.optimise import MapOptimiser
-from msgs_slam.pipelines.mapping.schedule import Step
+from msgs_slam.pipelines.mapping.optimise import MapOptimiser, Step
 from msgs_slam.pipelines.mapping.state import OptimiserState
 from msgs_slam.pipelines.mapping.views import View, make_view
 from msgs_slam.pipelines.render.api import render

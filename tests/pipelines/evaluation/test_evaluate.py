@@ -22,7 +22,6 @@ from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.evaluation.write import evaluation_rows, evaluation_table, write_evaluation
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.se3 import Similarity
-from msgs_slam.pipelines.mapping.move_map import rows_of
 from msgs_slam.pipelines.render.api import render
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.outcome import load_outcome
@@ -197,7 +196,7 @@ def test_a_truth_of_free_unit_claims_no_metres(oracle_run: OracleRun, truth: Dat
 def test_every_image_of_the_source_is_judged_beside_the_picked_frames(oracle_run: OracleRun, truth: Dataset) -> None:
     outcome = load_outcome(oracle_run(video=True))
     every = outcome.trajectory
-    picked = replace(outcome, frames=outcome.frames[::2], trajectory=rows_of(every, every.frame_ids[::2]), every=every)
+    picked = replace(outcome, frames=outcome.frames[::2], trajectory=every.of_frames(every.frame_ids[::2]), every=every)
     result = evaluate_outcome(picked, truth, max_views=1)
     assert [result["trajectory"][f"sim3 {rows}"]["frames"] for rows in ("all", "every image")] == [16, 32]
     assert result["trajectory"]["se3 every image"]["max"] < 1e-6

@@ -199,11 +199,6 @@ def test_a_damaged_first_image_does_not_cost_the_set(short: Dataset, tmp_path: P
         assert "git-LFS" in "".join(warnings)
 
 
-def test_times_stay_those_of_the_set(short: Dataset, tmp_path: Path) -> None:
-    source = open_recording(tum(short, tmp_path / "set"))
-    assert next(iter(source.read())).timestamp == pytest.approx(START + short.timestamps[0], abs=1e-6)
-
-
 def test_a_data_set_is_reconstructed_with_what_it_knows(truth: Dataset, tmp_path: Path) -> None:
     """TUM layout, nothing said but that its depth is wanted: its camera is taken, lengths are metres, times its own."""
     path, run = tum(truth, tmp_path / "set"), RunFolder(tmp_path / "set.msgs")

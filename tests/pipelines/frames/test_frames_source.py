@@ -113,14 +113,6 @@ def test_images_that_others_would_see_differently_are_not_copied(tmp_path: Path)
     assert source.name(1, 1) == "b.bmp.png"
 
 
-@pytest.mark.parametrize("sizes", [((48, 64), (48, 65)), ((48, 64), (64, 48))])
-def test_images_of_different_sizes_are_refused(sizes: tuple[tuple[int, int], ...], tmp_path: Path) -> None:
-    for i, size in enumerate(sizes):
-        write_rgb(tmp_path / f"{i}.png", _noise(i, size))
-    with pytest.raises(InputError, match=r"differ in size: 0\.png is 64x48, 1\.png"):
-        open_recording(tmp_path)
-
-
 def test_a_folder_of_damaged_images_is_refused(tmp_path: Path) -> None:
     for i in range(3):
         (tmp_path / f"{i}.jpg").write_bytes(b"\xff\xd8\xff damaged")
@@ -256,13 +248,6 @@ def test_archives_and_folders_of_folders_are_told_what_to_give(tmp_path: Path) -
     done = CliRunner().invoke(main, ["reconstruct", str(tmp_path / "scan"), "--out", str(tmp_path / "run"), "--quiet"])
     assert done.exit_code
     assert "holds one image only; a reconstruction needs several views of a scene: the folder photos/" in done.output
-
-
-def test_pointers_in_place_of_images_are_named(tmp_path: Path) -> None:
-    for i in range(3):
-        (tmp_path / f"{i}.JPG").write_text("version https://git-lfs.github.com/spec/v1\n")
-    with pytest.raises(InputError, match=r"none of the 3 images.*0\.JPG is a git-LFS pointer"):
-        open_recording(tmp_path)
 
 
 def write_photos(folder: Path, placed: int, count: int) -> Path:

@@ -7,7 +7,7 @@ import torch
 
 from msgs_slam.pipelines.geometry import voxels
 from msgs_slam.pipelines.geometry.camera import pixel_centers, project, project_gaussians, unproject, unproject_depth
-from msgs_slam.pipelines.geometry.room_layout import CEILING, OTHER, Gravity, find_gravity, floor_plane, name_structure
+from msgs_slam.pipelines.geometry.voxels import CEILING, OTHER, Gravity, find_gravity, floor_plane, name_structure
 from msgs_slam.pipelines.types import Intrinsics
 
 CAMERA = Intrinsics(64, 48, 51.0, 53.0, 31.3, 25.2)

@@ -2,7 +2,6 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,15 +15,12 @@ from msgs_slam.pipelines.global_ba import loops
 from msgs_slam.pipelines.global_ba.close import adjust_with_loops, reprojection_error
 from msgs_slam.pipelines.global_ba.loops import (
     FoundLoops,
-    KeyframeView,
-    find_loops,
+    LoopSearch,
     loop_candidates,
     make_keyframe_view,
     shared_points,
-    verify_loop,
 )
 from msgs_slam.pipelines.sfm.features import GlobalDescriptors, global_descriptor, learn_vocabulary
-from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.state import TrackState
 from msgs_slam.pipelines.types import Features, Intrinsics
 
@@ -40,13 +36,15 @@ class Walk:
     model: SparseModel
     features: list[Features]
 
-    def views(self) -> list[KeyframeView]:
+    @property
+    def search(self) -> LoopSearch:
         state = TrackState.from_backbone(self.model, 0.5)
         rows = zip(self.model.frame_ids.tolist(), self.model.cam_from_world, self.features, strict=True)
         points = self.model.points_in_world
-        return [
+        views = [
             make_keyframe_view(i, p, f, state.sightings[i], points, np.zeros(len(f.xy)), CAMERA) for i, p, f in rows
         ]
+        return LoopSearch(views, self.model.cam_from_world, CAMERA, 0)
 
     def pairs(self, refused: Collection[tuple[int, int]] = ()) -> list[tuple[int, int]]:
         vocabulary = learn_vocabulary(self.features, 0)
@@ -54,11 +52,11 @@ class Walk:
         return loop_candidates(self.model, looks, refused)
 
     def find(self) -> FoundLoops:
-        return find_loops(self.pairs(), self.views(), self.model.cam_from_world, CAMERA, 0)
+        return self.search.find(self.pairs())
 
 
 def circle_poses(count: int, laps: float) -> Array:
-    """Cameras on a circle of radius 1, looking outwards."""
+    """Cameras on a circle of radius 1, search outwards."""
     out = np.tile(np.eye(4), (count, 1, 1))
     for k, angle in enumerate(np.linspace(0, 2 * np.pi * laps, count)):
         c, s = np.cos(angle), np.sin(angle)
@@ -141,8 +139,7 @@ def test_candidates_are_revisits() -> None:
 
 def test_verified_loop_has_the_true_motion() -> None:
     walk = make_walk(drift=0.002, scale_drift=0.003)
-    views = walk.views()
-    loop = verify_loop(views[2], views[37], CAMERA, 0)
+    loop = walk.search.verify(2, 37)
     assert loop is not None
     truth = walk.truth[37] @ se3.inverse(walk.truth[2])
     apart = se3.log(loop.edge.frame2_from_frame1 @ se3.inverse(truth))
@@ -152,8 +149,7 @@ def test_verified_loop_has_the_true_motion() -> None:
 
 
 def test_places_without_overlap_are_not_verified() -> None:
-    views = make_walk().views()
-    assert verify_loop(views[2], views[20], CAMERA, 0) is None
+    assert make_walk().search.verify(2, 20) is None
 
 
 @pytest.mark.parametrize(("drift", "growth"), [(0.0, 0.0), (0.0015, 0.001), (-0.001, -0.002)])
@@ -171,23 +167,22 @@ def test_closing_takes_the_drift_away(drift: float, growth: float) -> None:
 
 
 def test_equal_texture_on_the_far_side_is_no_loop() -> None:
-    walk = make_walk(twins=True)
-    views = walk.views()
+    search = make_walk(twins=True).search
     # The pair matches and verifies: appearance and local geometry cannot know better.
-    trap = verify_loop(views[2], views[20], CAMERA, 0)
+    trap = search.verify(2, 20)
     assert trap is not None
     assert trap.edge.inliers > 50
-    found = find_loops([(2, 20), (3, 21), (4, 22), (2, 37), (3, 38)], views, walk.model.cam_from_world, CAMERA, 0)
+    found = search.find([(2, 20), (3, 21), (4, 22), (2, 37), (3, 38)])
     assert found.implausible == 3
     assert {(x.edge.frame1_id, x.edge.frame2_id) for x in found.loops} == {(2, 37), (3, 38)}
 
 
 def test_a_weak_loop_needs_a_neighbour_that_agrees(monkeypatch: pytest.MonkeyPatch) -> None:
-    walk = make_walk()
+    search = make_walk().search
     monkeypatch.setattr(loops, "SURE_INLIERS", 10**6)
-    assert len(find_loops([(2, 37)], walk.views(), walk.model.cam_from_world, CAMERA, 0).loops) == 1
+    assert len(search.find([(2, 37)]).loops) == 1
     monkeypatch.setattr(loops, "AGREEMENT", 1e-3)
-    found = find_loops([(2, 37)], walk.views(), walk.model.cam_from_world, CAMERA, 0)
+    found = search.find([(2, 37)])
     assert (len(found.loops), found.unsupported) == (0, 1)
 
 
@@ -195,28 +190,6 @@ def test_reprojection_error_is_that_of_the_noise() -> None:
     state = TrackState.from_backbone(make_walk().model, 0.5)
     # Median of a Rayleigh variable of sigma 0.4.
     assert reprojection_error(state, CAMERA) == pytest.approx(0.4 * 1.1774, rel=0.05)
-
-
-def test_found_loops_come_back_from_disk(tmp_path: Path) -> None:
-    found = make_walk().find()
-    save_value(tmp_path / "loops.npz", found)
-    back = load_value(tmp_path / "loops.npz")
-    assert (back.tried, back.implausible) == (found.tried, found.implausible)
-    for a, b in zip(found.loops, back.loops, strict=True):
-        assert a.edge.inliers == b.edge.inliers
-        assert np.array_equal(a.edge.frame2_from_frame1, b.edge.frame2_from_frame1)
-        assert np.array_equal(a.in_first.xy, b.in_first.xy)
-        assert np.array_equal(a.in_second.point, b.in_second.point)
-    empty = FoundLoops([], 3, 0, 0)
-    save_value(tmp_path / "none.npz", empty)
-    assert load_value(tmp_path / "none.npz") == empty
-
-
-def test_search_is_repeatable() -> None:
-    first, second = make_walk().find(), make_walk().find()
-    assert [x.edge.frame2_from_frame1.tobytes() for x in first.loops] == [
-        x.edge.frame2_from_frame1.tobytes() for x in second.loops
-    ]
 
 
 def test_the_same_place_looks_alike_and_others_by_chance() -> None:

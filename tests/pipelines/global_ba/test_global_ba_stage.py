@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.textfile import write_json
 from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.depth.fields import DepthFields
+from msgs_slam.pipelines.depth.fields import FINE, DepthFields
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import unproject
-from msgs_slam.pipelines.geometry.se3 import align_points
+from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.global_ba.loops import FoundLoops
 from msgs_slam.pipelines.global_ba.stage import run as run_global_ba
@@ -45,47 +45,42 @@ FIRST_AGAIN = 12
 """From this keyframe on the points carry new numbers, as after a walk that came back without noticing."""
 
 
-def finish_mapping(made: MadeRun, frames: list[WorldFrame]) -> None:
-    """What tracking and mapping would have left: a drifted second half, and a map of one Gaussian a sample."""
+def finish_mapping(made: MadeRun, frames: list[WorldFrame], slip: Similarity) -> None:
+    """What tracking and mapping would have left: a second half that has drifted by `slip`, and a map of one Gaussian a
+    sample."""
     run = made.run
     backbone = run.find(BACKBONE)
     assert backbone is not None
     tracking, mapping = run.stage("tracking"), run.stage("mapping")
     tracking.mkdir()
     mapping.mkdir()
-    rng = np.random.default_rng(5)
-    slip = small_motion(rng, 0.006, 0.03)
     # As after an adjustment: keyframes where they belong, but for the slip.
     model = doubled(replace(backbone, cam_from_world=made.cam_from_world[backbone.frame_ids]), slip)
     SPARSE.save(tracking, model)
-    DEPTH_FIELDS.save(tracking, DepthFields({}))
+    keyframes = model.frame_ids.tolist()
+    scale = {k: slip.scale if k >= FIRST_AGAIN else 1.0 for k in keyframes}
+    fields = {k: np.full((FINE.rows, FINE.columns), np.log(s)) for k, s in scale.items()}
+    DEPTH_FIELDS.save(tracking, DepthFields(fields if slip.scale != 1 else {}))
     poses = made.cam_from_world.copy()
-    poses[FIRST_AGAIN:] = poses[FIRST_AGAIN:] @ se3.inverse(slip)
+    poses[FIRST_AGAIN:] = slip.apply_to_poses(poses[FIRST_AGAIN:])
     ids = np.arange(len(frames))
     trajectory = Trajectory(ids, ids / 10, poses, np.isin(ids, model.frame_ids), ("",) * len(frames))
     TRAJECTORY.save(mapping, trajectory)
-    keyframes = model.frame_ids.tolist()
     class_ids = occurring_classes([run.load(PROXY_MAPS, of=k).labels for k in keyframes])
-    MAP.save(mapping, seeded_map(frames, poses, keyframes, run, len(class_ids)))
-    EXPOSURE.save(
-        mapping,
-        {
-            "frame_ids": model.frame_ids,
-            "log_gains": np.zeros((len(keyframes), 3), np.float32),
-            "offsets": np.zeros((len(keyframes), 3), np.float32),
-        },
-    )
+    scaled = [replace(f, depth=f.depth * scale.get(i, 1.0)) for i, f in enumerate(frames)]
+    MAP.save(mapping, seeded_map(scaled, poses, keyframes, run, len(class_ids)))
+    nothing = np.zeros((len(keyframes), 3), np.float32)
+    EXPOSURE.save(mapping, {"frame_ids": model.frame_ids, "log_gains": nothing, "offsets": nothing})
     write_json(mapping / "mapping.json", {"class_ids": list(class_ids)})
 
 
-def doubled(model: SparseModel, slip: Array) -> SparseModel:
+def doubled(model: SparseModel, slip: Similarity) -> SparseModel:
     """The model with the keyframes from FIRST_AGAIN on, and their own copies of the points, moved by `slip`."""
     late = model.frame_ids >= FIRST_AGAIN
     poses = model.cam_from_world.copy()
-    poses[late] = poses[late] @ se3.inverse(slip)
-    count = len(model.points_in_world)
-    points = np.concatenate([model.points_in_world, se3.transform(slip, model.points_in_world)])
-    numbers = model.obs_point + count * late[model.obs_frame]
+    poses[late] = slip.apply_to_poses(poses[late])
+    points = np.concatenate([model.points_in_world, slip.apply(model.points_in_world)])
+    numbers = model.obs_point + len(model.points_in_world) * late[model.obs_frame]
     colors = np.concatenate([model.colors, model.colors])
     return SparseModel(model.frame_ids, poses, points, colors, model.obs_frame, numbers, model.obs_xy)
 
@@ -125,7 +120,8 @@ def mapped(
 
     def make(name: str) -> MadeRun:
         made = make_run(tmp_path / name, keyframes=tuple(range(0, 24, 2)), backbone_scale=1.0)
-        finish_mapping(made, room_frames[1])
+        slip = small_motion(np.random.default_rng(5), 0.006, 0.03)
+        finish_mapping(made, room_frames[1], Similarity(1.0, slip[:3, :3], slip[:3, 3]))
         return made
 
     return make
@@ -169,7 +165,7 @@ def test_without_loops_nothing_moves(
     mapped: Callable[[str], MadeRun], open_stage: Callable[..., StageContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = mapped("run")
-    monkeypatch.setattr("msgs_slam.pipelines.global_ba.stage.search", lambda *_: FoundLoops([], 0, 0, 0))
+    monkeypatch.setattr("msgs_slam.pipelines.global_ba.stage.GlobalStage.search", lambda *_: FoundLoops([], 0, 0, 0))
     figures = finish(open_stage(made.run, "global_ba", load_config()))
     assert figures["loops"] == 0
     assert figures["joint"] == "not run"

@@ -16,12 +16,6 @@ def pictures(dtype: torch.dtype = torch.float32, size: tuple[int, int] = (24, 31
     return a, (0.7 * a + 0.3 * b)
 
 
-def test_ssim_of_a_picture_with_itself_is_one() -> None:
-    a, b = pictures()
-    assert ssim_map(a, a).min() > 0.9999
-    assert 0.1 < ssim_map(a, b).mean() < 0.99
-
-
 def test_ssim_agrees_with_scikit_image_inside() -> None:
     a, b = pictures(torch.float64)
     _, truth = structural_similarity(

@@ -17,14 +17,17 @@ pytest.importorskip("triton", minversion="3.3", reason="needs triton >= 3.3: pip
 
 from msgs_slam.pipelines.config import MappingConfig  # noqa: E402
 from msgs_slam.pipelines.mapping import growth, losses  # noqa: E402
-from msgs_slam.pipelines.mapping.losses import expose, fit_exposure  # noqa: E402
-from msgs_slam.pipelines.mapping.objective import (  # noqa: E402
-    Objective,
+from msgs_slam.pipelines.mapping.cuda_losses import (  # noqa: E402
+    card_loss,
     color_errors_on_card,
     fit_exposure_on_card,
 )
-from msgs_slam.pipelines.mapping.optimise import MapOptimiser, optimise_map  # noqa: E402
-from msgs_slam.pipelines.mapping.schedule import Step  # noqa: E402
+from msgs_slam.pipelines.mapping.losses import Objective, expose, fit_exposure  # noqa: E402
+from msgs_slam.pipelines.mapping.optimise import (  # noqa: E402
+    MapOptimiser,
+    Step,
+    optimise_map,
+)
 from msgs_slam.pipelines.mapping.state import (  # noqa: E402
     KEYS,
     OptimiserState,
@@ -83,24 +86,15 @@ def test_the_loss_has_the_plain_value_and_gradient(size: tuple[int, int], masked
     objective, found = Objective(MappingConfig(), UNIT), []
     for place, device, kind in ((there, DEVICE, torch.float32), (lambda v: v, "cpu", torch.float64)):
         leaves = [x.to(device, kind, copy=True).requires_grad_() for x in (features, depth, silhouette, log_radii)]
-        marks = in_view.to(device) if kind == torch.float32 else None
-        sizes = leaves[3] if marks is not None else leaves[3][in_view]
-        drawn = Rendering(*leaves[:3])
-        value = objective.of(place(view), EXPOSURE.to(device, kind), drawn, sizes, marks)
+        seen = (place(view), EXPOSURE.to(device, kind), Rendering(*leaves[:3]))
+        if kind == torch.float32:
+            value = card_loss(objective, *seen, leaves[3], in_view.to(device))
+        else:
+            value = objective.of(*seen, leaves[3][in_view])
         found.append([value.detach(), *torch.autograd.grad(3 * value, leaves)])
     for mine, theirs in zip(*found, strict=True):
         assert theirs.abs().max() > 0
         assert (mine.cpu().double() - theirs).abs().max() < 1e-5 * theirs.abs().max()
-
-
-def test_the_loss_without_depth_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    generator = torch.Generator().manual_seed(1)
-    view, features = made_view((9, 12), 0, False, generator)
-    leaves = [x.to(DEVICE).requires_grad_() for x in (features, torch.rand(9, 12), torch.rand(9, 12))]
-    objective = Objective(MappingConfig(depth_weight=0.0), UNIT)
-    rest = (torch.zeros(3, device=DEVICE), torch.ones(3, dtype=torch.bool, device=DEVICE))
-    value = objective.of(there(view), EXPOSURE.to(DEVICE), Rendering(*leaves), *rest)
-    assert torch.autograd.grad(value, leaves[1])[0].abs().max() == 0
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -176,7 +170,7 @@ def test_visits_are_those_of_the_cpu(started: Any, monkeypatch: pytest.MonkeyPat
 @pytest.mark.skipif(ON_CARD, reason="the tests above compile and run the kernels")
 def test_the_kernels_compile_for_cards(tmp_path: Path) -> None:
     kernels = {
-        "mapping.loss_kernels": [
+        "mapping.cuda_losses": [
             "expose_colors", "blur_planes", "compare_moments", "differentiate", "color_errors", "fit_color",
             "compare_maps", "weigh_sizes",
         ],

@@ -11,9 +11,9 @@ import torch
 from msgs_slam.pipelines.config import MappingConfig
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import resize_depth
-from msgs_slam.pipelines.mapping.division import split_frames
+from msgs_slam.pipelines.mapping.growth import Seeding
 from msgs_slam.pipelines.mapping.move_map import interpolate_rows, move_trajectory
-from msgs_slam.pipelines.mapping.schedule import RATE_DECAY, Schedule, Seeding, keyframe_weights
+from msgs_slam.pipelines.mapping.optimise import RATE_DECAY, Schedule, keyframe_weights
 from msgs_slam.pipelines.mapping.views import MappingInput, channel_table, half_view, load_views, occurring_classes
 from msgs_slam.pipelines.run.files import CALIBRATION, CLASSES, PROXY_MAPS, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -107,10 +107,10 @@ def test_classes_that_hardly_occur_get_no_channel() -> None:
 
 def test_hold_out_takes_keyframes_and_others_alike() -> None:
     trajectory = walk()
-    assert split_frames(trajectory, 0) == ([0, 2, 5], [])
+    assert trajectory.split(0) == ([0, 2, 5], [])
     # Every fourth from 2 on: frame 2, a keyframe; every second from 1 on: 1 and 5, for 3 is lost.
-    assert split_frames(trajectory, 4) == ([0, 5], [2])
-    assert split_frames(trajectory, 2) == ([0, 2], [1, 5])
+    assert trajectory.split(4) == ([0, 5], [2])
+    assert trajectory.split(2) == ([0, 2], [1, 5])
 
 
 def test_keyframe_weights_fade_with_age_and_unreliability() -> None:

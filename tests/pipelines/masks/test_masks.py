@@ -19,7 +19,7 @@ from msgs_slam.pipelines.depth.stereo.volume import Bands
 from msgs_slam.pipelines.frames.keyframes import choose_keyframes
 from msgs_slam.pipelines.frames.masks import FrameMasks, check_masks, open_masks
 from msgs_slam.pipelines.geometry.voxels import to_lab
-from msgs_slam.pipelines.mapping.objective import Objective
+from msgs_slam.pipelines.mapping.losses import Objective
 from msgs_slam.pipelines.mapping.views import View, make_view
 from msgs_slam.pipelines.masks.moving import MovingView, find_moving, find_moving_once
 from msgs_slam.pipelines.masks.people import PeopleFinder, join_people, people_cards

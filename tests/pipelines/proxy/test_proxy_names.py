@@ -10,9 +10,8 @@ from proxy_room import UNIT, Room
 
 from msgs_slam.pipelines.evaluation.labels import count_labels, score
 from msgs_slam.pipelines.geometry import voxels
-from msgs_slam.pipelines.geometry.room_layout import FLOOR, OTHER, Gravity
 from msgs_slam.pipelines.geometry.sequence import resample_linear
-from msgs_slam.pipelines.geometry.voxels import Voxels, merge, voxel_keys
+from msgs_slam.pipelines.geometry.voxels import FLOOR, OTHER, Gravity, Voxels, merge, voxel_keys
 from msgs_slam.pipelines.labels.named import NamedScene, NetworkClasses, disputed, name_likelihood, one_name_each
 from msgs_slam.pipelines.labels.segments import SegmentLabels
 from msgs_slam.pipelines.networks.outputs import best_classes

@@ -7,7 +7,7 @@ from render_scenes import IMAGES, NAMES, random_gaussians, room
 from torch import Tensor
 
 from msgs_slam.pipelines.geometry import se3
-from msgs_slam.pipelines.render.api import Rendering, composite, moved, project_map, render
+from msgs_slam.pipelines.render.api import composite, moved, project_map, render
 from msgs_slam.pipelines.system.threads import get_threads, set_threads
 from msgs_slam.pipelines.types import Intrinsics
 
@@ -92,12 +92,6 @@ def test_no_channels():
 def test_a_hundred_thousand_in_one_tile(opacity):
     scene = random_gaussians(100_000, 16, 16, 3, seed=4, sigma=(0.3, 0.8), opacity=opacity)
     assert_agrees(scene, 16, 16)
-
-
-def test_large_gaussians_in_numbers():
-    """Each of 400 Gaussians touches every band and tile: nothing has a fixed capacity."""
-    scene = random_gaussians(400, 64, 100, 3, seed=5, sigma=(40.0, 90.0), opacity=(0.004, 0.02), behind=0.0)
-    assert_agrees(scene, 64, 100)
 
 
 def test_full_size_room():
@@ -209,30 +203,14 @@ def test_pose_gradient_equals_finite_differences():
     tensors = [x.double() for x in (scene.means, scene.radii, scene.opacities, scene.colors)]
     pose = se3.exp(torch.tensor([0.02, 0.01, -0.03, 0.02, 0.01, -0.01]).double())
 
-    def loss(image: Rendering) -> Tensor:
+    def loss_at(twist: Tensor) -> Tensor:
+        image = render(*tensors, pose, scene.intrinsics, twist=twist, backend=reference)
         return (image.features**2).sum() + image.depth.sum() + (image.silhouette**2).sum()
 
-    def loss_at(twist: Tensor) -> Tensor:
-        return loss(render(*tensors, pose, scene.intrinsics, twist=twist, backend=reference))
-
-    twist = torch.tensor([0.01, 0.0, -0.01, 0.0, 0.01, 0.02], dtype=torch.float64)
-    value = loss_at(twist.requires_grad_())
-    (gradient,) = torch.autograd.grad(value, twist)
-    twist = twist.detach()
-    steps = 1e-7 * torch.eye(6, dtype=torch.float64)
-    numeric = torch.stack([(loss_at(twist + step) - loss_at(twist - step)) / 2e-7 for step in steps])
-    assert gradient.norm() > 1
-    torch.testing.assert_close(gradient, numeric, rtol=1e-4, atol=1e-4 * float(gradient.norm()))
-
-
-def test_projection_puts_points_where_the_camera_sees_them():
-    scene = room(40, 30, 100, 1)
-    u, v, sigma, z = project_map(scene.means, scene.radii, torch.eye(4).double(), scene.intrinsics)
-    k = scene.intrinsics
-    torch.testing.assert_close(u, k.fx * scene.means[:, 0] / scene.means[:, 2] + k.cx)
-    torch.testing.assert_close(v, k.fy * scene.means[:, 1] / scene.means[:, 2] + k.cy)
-    torch.testing.assert_close(sigma, k.fx * scene.radii / scene.means[:, 2])
-    torch.testing.assert_close(z, scene.means[:, 2])
+    twist = torch.tensor([0.01, 0.0, -0.01, 0.0, 0.01, 0.02], dtype=torch.float64, requires_grad=True)
+    size = torch.autograd.grad(loss_at(twist), twist)[0].norm()
+    assert size > 1
+    assert torch.autograd.gradcheck(loss_at, twist, eps=1e-7, rtol=1e-4, atol=1e-4 * float(size))
 
 
 def test_centres_at_or_behind_the_camera_leave_no_trace():

@@ -104,8 +104,7 @@ def test_kernels_compile_for_cards_and_fit_their_shared_memory(name, channels, t
     """The interpreter accepts more than the compiler does; compiling needs no card."""
     settings = cuda._back_settings(channels) if name == "backward_tile" else cuda._settings(channels)
     kinds = {**dict.fromkeys(("width", "height", "channels"), "i32"), "starts": "*i64"}
-    of = {"render.cuda_kernels": [name]}
-    build(of, settings | {"COUNTED": True}, kinds | {"members": "*i64"}, tmp_path)
+    build({"render.cuda": [name]}, settings | {"COUNTED": True}, kinds | {"members": "*i64"}, tmp_path)
 
 
 @pytest.mark.skipif(ON_CARD, reason="the tests above compile and run the kernels")
@@ -116,8 +115,7 @@ def test_what_projects_and_lists_compiles_for_cards(tmp_path):
     numbers |= dict.fromkeys(("fx", "fy", "cx", "cy", "focal", "near"), "fp32")
     kernels = {
         "render.cuda_projection": ["project_rows", "record_rows", "mark_rows", "back_project_rows"],
-        "render.cuda": ["count_tiles", "list_pairs", "order_members"],
-        "render.cuda_kernels": ["divide_pixels", "divide_back_pixels"],
+        "render.cuda": ["count_tiles", "list_pairs", "order_members", "divide_pixels", "divide_back_pixels"],
     }
     build(kernels, constants, {**long, **numbers, "marks": "*u8"}, tmp_path)
 

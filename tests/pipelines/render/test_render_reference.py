@@ -49,14 +49,3 @@ def test_gradients_equal_finite_differences():
     reach = sigma * (2 * torch.log(opacity / ALPHA_MIN)).clamp(max=9).sqrt()
     assert (distance - reach).abs().min() > 1e-4
     assert torch.autograd.gradcheck(images, tuple(leaves(scene).values()), eps=1e-6, atol=1e-6)
-
-
-def test_depth_is_normalised_by_the_silhouette():
-    """Two opaque layers: depth lies between them, near the nearer one."""
-    two = {
-        "u": torch.full((2,), 1.5), "v": torch.full((2,), 1.5), "sigma_px": torch.full((2,), 50.0),
-        "z": torch.tensor([1.0, 3.0]), "opacity": torch.full((2,), 0.9), "features": torch.eye(2),
-    }  # fmt: skip
-    image = composite(**two, width=3, height=3, backend=reference)
-    assert (image.depth_silhouette == image.silhouette).all()
-    assert (image.depth_sum / image.depth_silhouette)[1, 1] == pytest.approx(0.9 * 1 / 0.99 + 0.09 * 3 / 0.99, abs=1e-2)

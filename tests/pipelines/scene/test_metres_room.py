@@ -14,9 +14,8 @@ from msgs_slam.pipelines.config import Config, ExportConfig
 from msgs_slam.pipelines.depth.fields import DepthFields
 from msgs_slam.pipelines.export.stage import metres_figures
 from msgs_slam.pipelines.export.stage import run as export
-from msgs_slam.pipelines.geometry.room_layout import CEILING, FLOOR, OTHER, Gravity
 from msgs_slam.pipelines.geometry.se3 import Similarity
-from msgs_slam.pipelines.geometry.voxels import Voxels
+from msgs_slam.pipelines.geometry.voxels import CEILING, FLOOR, OTHER, Gravity, Voxels
 from msgs_slam.pipelines.networks.registry import _room_classes
 from msgs_slam.pipelines.run.files import DEPTH_FIELDS, FIGURES, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder

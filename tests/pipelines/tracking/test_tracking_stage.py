@@ -28,7 +28,8 @@ from msgs_slam.pipelines.run.files import (
 )
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.sfm.features import global_descriptor
-from msgs_slam.pipelines.tracking import adjust, pictures, segments, stage
+from msgs_slam.pipelines.tracking import adjust, segments, stage
+from msgs_slam.pipelines.tracking import state as tracking_state
 from msgs_slam.pipelines.tracking.stage import run as run_tracking
 from msgs_slam.pipelines.tracking.stage import stretches
 from msgs_slam.pipelines.tracking.state import TrackState
@@ -99,9 +100,9 @@ def test_a_keyframe_is_described_once_however_often_frames_are_compared_with_it(
         described.append(len(described))
         return global_descriptor(*given)
 
-    monkeypatch.setattr(pictures, "global_descriptor", counted)
+    monkeypatch.setattr(tracking_state, "global_descriptor", counted)
     context = open_stage(made.run, "tracking")
-    looked_up = pictures.Pictures(made.run, context.config.frames)
+    looked_up = tracking_state.Pictures(made.run, context.config.frames)
     keyframes = list(range(0, 24, 2))
     first = looked_up.similarities(looked_up.descriptor(1)[None], keyframes)
     for _ in range(3):

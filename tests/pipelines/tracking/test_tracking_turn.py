@@ -13,9 +13,9 @@ from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.tracking.front_end import fit_rotation, turn_between
-from msgs_slam.pipelines.tracking.pictures import Pictures
 from msgs_slam.pipelines.tracking.stage import run as run_tracking
 from msgs_slam.pipelines.tracking.stage import warn_of_stretches
+from msgs_slam.pipelines.tracking.state import Pictures
 from msgs_slam.pipelines.types import Frame, Intrinsics, Trajectory
 from tests.pipelines.tracking.conftest import MadeRun
 from tests.world.clip import ClipOptions, WorldFrame, develop, make_world, render_view

@@ -1,11 +1,118 @@
-"""Triton kernels of the mapping loss: `losses` on a GPU, value and gradient in one pass.
+"""The mapping loss on a GPU: Triton kernels of what `losses` does, value and gradient in one pass, and their launches.
 
 The sums are atomic additions: their last bits may differ from run to run. The interpreter of Triton (environment
 variable TRITON_INTERPRET=1) runs these kernels on CPU tensors.
 """
 
+import math
+from functools import lru_cache
+from typing import Any
+
+import torch
 import triton
 import triton.language as tl
+from torch import Tensor
+
+from ..render.api import Rendering
+from ..system import gpu
+from ..system.ssim import C1, C2, TAPS, WINDOW
+from .losses import (
+    MAX_GAIN,
+    MIN_PIXELS,
+    NU,
+    OUTLIER,
+    RIDGE,
+    SILHOUETTE_WEIGHT,
+    SIZE_LIMIT,
+    SOLID,
+    SSIM_WEIGHT,
+    STRIDE,
+    Objective,
+)  # fmt: skip
+from .views import View
+
+_BLOCK = 512
+"""Numbers a program of the kernels."""
+
+
+def card_loss(
+    objective: Objective, view: View, exposure: Tensor, rendering: Rendering, log_radii: Tensor, in_view: Tensor
+) -> Tensor:
+    """Scalar, differentiable in the rendering and the log radii (M,), of which those count that are in_view (M,)."""
+    images = (rendering.features, rendering.depth, rendering.silhouette)
+    return _CardLoss.apply(*images, log_radii, view, exposure, in_view, objective)
+
+
+@torch.no_grad()
+def fit_exposure_on_card(rendering: Rendering, view: View, exposure: Tensor) -> None:
+    """`fit_exposure` of what the map covers in a view, in place, on a contiguous exposure (2, 3)."""
+    height, width = rendering.silhouette.shape
+    shown, silhouette = rendering.features.detach(), rendering.silhouette.detach().contiguous()
+    given = (shown, shown.shape[-1], silhouette, view.image, _mask(view), exposure, width, height)
+    rules = {"SOLID": SOLID, "MIN_PIXELS": MIN_PIXELS, "OUTLIER": OUTLIER, "RIDGE": RIDGE, "MAX_GAIN": MAX_GAIN}
+    gpu.launch(fit_color, 3, *given, STRIDE=STRIDE, **rules, MASKED=view.scene is not None, BLOCK=1024)
+
+
+def color_errors_on_card(colors: Tensor, view: View, exposure: Tensor) -> Tensor:
+    """(H, W) mean difference between the exposed (H, W, C) colours and the view's photo, 0 where that is no scene."""
+    errors = torch.empty(colors.shape[:2], device=colors.device)
+    given = (colors.contiguous(), colors.shape[-1], exposure, view.image, _mask(view), errors)
+    _run(color_errors, errors.numel(), *given, errors.numel(), MASKED=view.scene is not None)
+    return errors
+
+
+def _mask(view: View) -> Tensor:
+    """A kernel takes no None: a mask that is not there is not read."""
+    return view.image if view.scene is None else view.scene.view(torch.uint8)
+
+
+def _run(kernel: Any, count: int, *arguments: Any, **settings: Any) -> None:
+    gpu.launch(kernel, -(-count // _BLOCK), *arguments, BLOCK=_BLOCK, **settings)
+
+
+@lru_cache(maxsize=2)
+def _window(device: torch.device) -> Tensor:
+    return torch.tensor(WINDOW, dtype=torch.float32, device=device)
+
+
+class _CardLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> Tensor:
+        features, depth, silhouette, log_radii = (x.detach().contiguous() for x in arguments[:4])
+        view, exposure, in_view, objective = arguments[4:]
+        loss = features.new_zeros(())
+        pulls = [torch.empty_like(x) for x in (features, depth, silhouette, log_radii)]
+        _add_photo(features, exposure, view, loss, pulls[0])
+        weights = (SILHOUETTE_WEIGHT, objective.settings.depth_weight / objective.unit)
+        given = (depth, silhouette, view.depth, view.reliability, _mask(view), loss, *pulls[1:3], depth.numel())
+        _run(compare_maps, depth.numel(), *given, *weights, NU=NU, MASKED=view.scene is not None)
+        sizes = (log_radii, in_view.view(torch.uint8), in_view.sum(), loss, pulls[3])
+        _run(weigh_sizes, len(log_radii), *sizes, math.log(SIZE_LIMIT * objective.unit), len(log_radii))
+        ctx.save_for_backward(*pulls)
+        return loss
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        return *torch._foreach_mul(ctx.saved_tensors, gradients[0]), *[None] * 4
+
+
+def _add_photo(features: Tensor, exposure: Tensor, view: View, loss: Tensor, gradient: Tensor) -> None:
+    """`photo_loss` of the first three features, their gradient into the gradient's first three."""
+    size, row, stride = view.image.numel(), 3 * view.image.shape[1], features.shape[-1]
+    planes, moments, half = (features.new_empty(5, size) for _ in range(3))
+    window = _window(features.device)
+    mask: dict[str, Any] = {"MASKED": view.scene is not None, "SHARE": SSIM_WEIGHT}
+
+    def blur(numbers: int, of: Tensor) -> None:
+        _run(blur_planes, numbers, of, half, window, size, row, 3, numbers, TAPS=TAPS)
+        _run(blur_planes, numbers, half, moments, window, size, size, row, numbers, TAPS=TAPS)
+
+    given = (features, stride, exposure, view.image, _mask(view))
+    _run(expose_colors, size, *given, planes, loss, size, **mask)
+    blur(5 * size, planes)
+    _run(compare_moments, size, moments, planes, loss, size, C1=C1, C2=C2, SHARE=SSIM_WEIGHT)
+    blur(3 * size, planes[2:])
+    _run(differentiate, size, planes, moments, exposure, _mask(view), gradient, stride, size, **mask)
 
 
 @triton.jit
@@ -166,7 +273,7 @@ def fit_color(
     STRIDE: tl.constexpr, SOLID: tl.constexpr, MIN_PIXELS: tl.constexpr, OUTLIER: tl.constexpr, RIDGE: tl.constexpr,
     MAX_GAIN: tl.constexpr, MASKED: tl.constexpr, BLOCK: tl.constexpr,
 ) -> None:  # fmt: skip
-    """`exposure.fit_exposure` of one colour, in place; one program sees all pixels that tell, so that sums are those of
+    """`losses.fit_exposure` of one colour, in place; one program sees all pixels that tell, so that sums are those of
     one order."""
     color = tl.program_id(0)
     across = (width + STRIDE - 1) // STRIDE
