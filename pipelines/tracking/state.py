@@ -290,7 +290,7 @@ class Pictures:
     def __init__(self, run: RunFolder, settings: FramesConfig, kept: int = 12) -> None:
         self.run, self.settings = run, settings
         self.vocabulary = run.load(VOCABULARY)
-        self.frames = {f.id: f for f in run.load(FRAMES)}
+        self.frames: dict[int, Frame] = {f.id: f for f in run.load(FRAMES)}
         self.intrinsics = run.load(CALIBRATION).intrinsics
         self._learned = open_learned(settings)
         self._grey = lru_cache(kept)(lambda i: to_grey(self.color(i)))
