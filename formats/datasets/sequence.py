@@ -60,11 +60,12 @@ class Dataset:
     sensor's known rate; None where unknown. image_paths: N paths, or none where `store` holds the frames. camera: None
     where unknown. world_from_cam (N, 4, 4) float64 with exact rotations, camera axes x right, y down, z forward; NaN
     for a frame without a pose; None without any. `metric` says whether the unit of the poses is the metre, else it is
-    any. depth_paths, label_paths: N paths, None for a frame without; empty without any.
-    depth_camera: the camera of the depth images where that is another one than `camera`. Depth in metres is
-    raw / depth_per_metre, unknown where raw is one of depth_invalid. classes: what `labels` gives indices into.
-    mask_paths: N paths as depth_paths, of images that are black where the frame shows no part of the scene. notes: what
-    a user should know about this recording, what of it is not used above all; one sentence each.
+    any. depth_paths, label_paths: N paths, None for a frame without; empty without any. depth_camera: the camera of the
+    depth images where that is another one than `camera`; color_from_depth: metres that its points are moved by to lie
+    in the colour camera. Depth in metres is raw / depth_per_metre, unknown where raw is one of depth_invalid. classes:
+    what `labels` gives indices into. mask_paths: N paths as depth_paths, of images that are black where the frame shows
+    no part of the scene. notes: what a user should know about this recording, what of it is not used above all; one
+    sentence each.
     """
 
     format: str
@@ -77,6 +78,7 @@ class Dataset:
     metric: bool = True
     depth_paths: tuple[Path | None, ...] = ()
     depth_camera: Camera | None = None
+    color_from_depth: tuple[float, float, float] = (0.0, 0.0, 0.0)
     depth_per_metre: float = 1000.0
     depth_invalid: tuple[int, ...] = (0, 65535)
     label_paths: tuple[Path | None, ...] = ()
@@ -139,8 +141,7 @@ class Dataset:
         """Return (h, w) float32 z-depth in metres with the field of view of the colour image, 0 = unknown; None
         without.
 
-        Depth of another camera is moved to the colour camera's pixels; the few centimetres between the two lenses
-        are left out, as these data sets do not state them.
+        Depth of another camera is moved to the colour camera's pixels.
         """
         if self.store is not None:
             raw = self.store.raw_depth(index)
@@ -152,7 +153,7 @@ class Dataset:
         depth[np.isin(raw, self.depth_invalid)] = 0
         if self.depth_camera is None or self.camera is None:
             return depth
-        return warp_nearest(depth, self.depth_camera, self.camera)
+        return shift_viewpoint(warp_nearest(depth, self.depth_camera, self.camera), self.camera, self.color_from_depth)
 
     def labels(self, index: int) -> NDArray[np.uint8] | None:
         """Return (h, w) uint8 indices into `classes`, VOID_LABEL for none of them; None without labels."""
@@ -233,6 +234,26 @@ def warp_nearest(image: NDArray[np.float32], source: Camera, target: Camera) -> 
     inside_x, inside_y = (column >= 0) & (column < source.width), (row >= 0) & (row < source.height)
     warped = image[np.ix_(row.clip(0, source.height - 1), column.clip(0, source.width - 1))]
     return np.where(inside_y[:, None] & inside_x[None, :], warped, np.float32(0)).astype(np.float32)
+
+
+def shift_viewpoint(
+    depth: NDArray[np.float32], camera: Camera, offset: tuple[float, float, float]
+) -> NDArray[np.float32]:
+    """Return (H, W) z-depth of a camera, 0 = unknown, as the same camera sees it from elsewhere: points there are those
+    here plus `offset` (metres). The nearest of several surfaces wins."""
+    if not any(offset):
+        return depth
+    row, column = np.nonzero(depth > 0)
+    z = depth[row, column].astype(np.float64)
+    there = z + offset[2]
+    u = (column + 0.5 - camera.cx) * (z / there) + camera.fx * offset[0] / there + camera.cx - 0.5
+    v = (row + 0.5 - camera.cy) * (z / there) + camera.fy * offset[1] / there + camera.cy - 0.5
+    out = np.full(depth.shape, np.inf)
+    # Two columns and rows each: a surface that the other camera sees from less aside has no gaps.
+    for y, x in ((f(v), g(u)) for f in (np.floor, np.ceil) for g in (np.floor, np.ceil)):
+        inside = (there > 0) & (x >= 0) & (y >= 0) & (x < depth.shape[1]) & (y < depth.shape[0])
+        np.minimum.at(out, (y[inside].astype(int), x[inside].astype(int)), there[inside])
+    return np.where(np.isfinite(out), out, 0).astype(np.float32)
 
 
 def known_classes(path: Path) -> tuple[LabelClass, ...]:

@@ -11,7 +11,7 @@ from PIL import Image
 from msgs_slam.formats.datasets import VOID_LABEL, Camera, Dataset, open_sequence
 from msgs_slam.formats.datasets.folder import poses_at
 from msgs_slam.formats.datasets.nerfstudio import write_transforms
-from msgs_slam.formats.datasets.sequence import warp_nearest
+from msgs_slam.formats.datasets.sequence import shift_viewpoint, warp_nearest
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
 from msgs_slam.formats.trajectory import write_tum
@@ -305,3 +305,16 @@ def test_transforms_come_back_through_the_data_set_reader(tmp_path: Path) -> Non
     np.testing.assert_allclose(sequence.world_from_cam, poses, atol=1e-12)
     with pytest.raises(ValueError, match="got 2 images"):
         write_transforms(tmp_path / "transforms.json", Camera(8, 6, 7.0, 7.5, 4.25, 3.0), names[:2], poses)
+
+
+def test_depth_of_a_camera_beside_is_moved_as_far_as_it_is_near() -> None:
+    camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
+    depth = np.full((48, 64), 2.0, np.float32)
+    depth[10:20, 30:40] = 1.0
+    seen = shift_viewpoint(depth, camera, (-0.1, 0.0, 0.0))
+    assert (seen[10:20, 24:34] == 1.0).all()
+    assert (seen[:9, :61] == 2.0).all()
+    assert (seen[:, 61:] == 0).all()
+    assert (seen[12, 34:37] == 0).all(), "what the near thing hid is unknown"
+    assert (seen[12, 37:61] == 2.0).all()
+    assert shift_viewpoint(depth, camera, (0.0, 0.0, 0.0)) is depth
