@@ -3,12 +3,13 @@
     python tests/benchmarks/shape.py RUN=TRUTH [RUN=TRUTH ...]          one row a run, and a table by confidence
     python tests/benchmarks/shape.py RUN=TRUTH --map --mesh             the map's depth and the mesh too, where they are
     python tests/benchmarks/shape.py RUN=TRUTH --sheet DIR              pictures of the worst keyframes
+    python tests/benchmarks/shape.py all --recordings WORK             recordings, or their NAMEs, run first, in WORK
 
-RUN is a run folder with the proxy stage done, TRUTH a data set with depth. Depths of a run are compared after one scale
-(the median), every third pixel of the keyframes with truth. "off": wrong by more than 5 %. "sure": reliability 0.5 or
-more. "plain": the third of the pixels with least contrast around them; "edges": within four pixels of a step of the
-true depth; "else": neither. "AUSE": area between the share that is off among the surest pixels and the least that any
-order could have, in per cent. Kitchen's truth is of a camera 2.5 cm aside: its edges count against any depth.
+RUN is a run folder with the proxy stage done, TRUTH a data set with depth, or a folder of `shared/data/real`, whose
+depth lies on its pictures. Depths of a run are compared after one scale (the median), every third pixel of the
+keyframes with truth. "off": wrong by more than 5 %. "sure": reliability 0.5 or more. "plain": the third of the pixels
+with least contrast around them; "edges": within four pixels of a step of the true depth; "else": neither. "AUSE":
+area between the share that is off among the surest pixels and the least that any order could have, in per cent.
 """
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
@@ -27,18 +28,29 @@ sys.path.insert(0, str(ROOT))
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from poses import REAL
+from tracking import write_video
 
 from msgs_slam.formats.datasets import open_sequence
+from msgs_slam.formats.images import read_depth_png
 from msgs_slam.pipelines.evaluation.evaluate import evaluate_outcome
 from msgs_slam.pipelines.evaluation.truth import match_truth
 from msgs_slam.pipelines.evaluation.views import render_outcome
 from msgs_slam.pipelines.geometry.camera import resample_nearest
+from msgs_slam.pipelines.reconstruct import reconstruct
 from msgs_slam.pipelines.run.files import CALIBRATION, FRAMES, PROXY_MAPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.outcome import load_outcome
+from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.sfm.lens import FramePixels
+from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Frame
 
+DATA = ROOT.parent / "shared" / "data"
+VIDEOS = {
+    "kitchen": (DATA / "videos" / "kitchen_640x480_30fps.mp4", DATA / "kitchen"),
+    **{name: (DATA / name / "video.mp4", DATA / name) for name in ("whiteroom", "whiteroom_2", "staircase")},
+}
 BINS = (0.0, 0.05, 0.15, 0.3, 0.5, 0.8, 1.01)
 SURE, OFF = 0.5, 0.05
 _STEP, _AROUND = 1.08, 9
@@ -68,11 +80,29 @@ class Pixels:
 
 def true_depths(run: RunFolder, truth: Path) -> dict[int, NDArray[np.float32]]:
     """True depth of the run's frames that have any, by id, as their undistorted pictures would show it."""
-    sequence, frames = open_sequence(truth), run.load(FRAMES)
-    by_name = all(f.name for f in frames) and len({f.name for f in frames}) == len(frames)
-    matched, pixels = match_truth(frames, by_name, sequence), FramePixels(run.load(CALIBRATION))
-    depths = {f.id: sequence.depth(int(k)) for f, k in zip(frames, matched.image, strict=True) if k >= 0}
+    frames, pixels = run.load(FRAMES), FramePixels(run.load(CALIBRATION))
+    if (truth / "intrinsics.txt").exists():
+        files = sorted((truth / "depth").iterdir())
+        depths = {f.id: read_depth_png(files[f.source_index]).astype(np.float32) / 1000 for f in frames}
+    else:
+        sequence = open_sequence(truth)
+        by_name = all(f.name for f in frames) and len({f.name for f in frames}) == len(frames)
+        matched = match_truth(frames, by_name, sequence)
+        depths = {f.id: sequence.depth(int(k)) for f, k in zip(frames, matched.image, strict=True) if k >= 0}
     return {i: pixels.sample(d) for i, d in depths.items() if d is not None}
+
+
+def run_recordings(names: list[str], work: Path) -> list[str]:
+    """Run recordings until proxy, where they are not yet; return RUN=TRUTH of each."""
+    pairs = []
+    for name in names or [*REAL, *VIDEOS]:
+        source, truth = VIDEOS.get(name, (work / f"{name}.mp4", DATA / "real" / name))
+        if name in REAL and not source.exists():
+            write_video(source, truth / "rgb", REAL[name])
+        run = RunFolder(work / f"{name}.msgs")
+        reconstruct(source, run, load_config(), SilentProgress(), "proxy")
+        pairs.append(f"{run.path}={truth}")
+    return pairs
 
 
 def proxy_views(run: RunFolder, truths: dict[int, NDArray[np.float32]]) -> Iterator[View]:
@@ -183,14 +213,16 @@ def write_sheet(views: list[View], target: Path, count: int = 4) -> None:
 def main() -> None:
     """Measure, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pairs", nargs="+", metavar="RUN=TRUTH")
+    parser.add_argument("pairs", nargs="+", metavar="RUN=TRUTH | NAME")
+    parser.add_argument("--recordings", type=Path, metavar="WORK", help="run recordings of these names first")
     parser.add_argument("--map", action="store_true", help="the map's depth as well")
     parser.add_argument("--mesh", action="store_true", help="the mesh's F-score and PSNR by `evaluate` as well")
     parser.add_argument("--sheet", type=Path, metavar="DIR")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     found: dict[str, dict] = {}
-    for pair in arguments.pairs:
+    names = [] if arguments.pairs == ["all"] else arguments.pairs
+    for pair in run_recordings(names, arguments.recordings) if arguments.recordings else arguments.pairs:
         folder, _, truth = pair.partition("=")
         run, name = RunFolder(Path(folder)), Path(folder).stem
         truths = true_depths(run, Path(truth))
