@@ -121,7 +121,7 @@ class FramesConfig:
     )
     parallax: float = setting(
         0.025,
-        "a new keyframe when points have moved by this fraction of the image's width (up or down: of its height)",
+        "a new keyframe when points have moved by this fraction of the longer side, or of 4/3 of the other if less",
         within=(0.001, 0.5),
         draft=0.06,
     )

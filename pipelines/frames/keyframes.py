@@ -28,6 +28,9 @@ _MAX_CORNERS = 600
 _MIN_TRACKS = 30
 _APART_PX = 6.0
 _LEVELS = 4
+_WIDE = 4 / 3
+"""An image counts as at most so much longer than its shorter side: what a narrow one shows is soon out of it, across
+and along."""
 _MIN_SURVIVORS = 0.5
 """With fewer of its tracks left there is a new keyframe in any case."""
 
@@ -35,7 +38,7 @@ _MIN_SURVIVORS = 0.5
 @dataclass(frozen=True)
 class KeyframeChoice:
     """keyframes: indices of the chosen frames; displacement (N,): median displacement of each frame from the keyframe
-    before it, as a fraction of width and height, infinite where the tracks were lost. has_detail: whether any frame has
+    before it, as a fraction of the longer side, infinite where the tracks were lost. has_detail: whether any frame has
     enough corners to follow."""
 
     keyframes: list[int]
@@ -44,7 +47,7 @@ class KeyframeChoice:
 
     @property
     def largest_displacement(self) -> float:
-        """Largest displacement that was seen, as a fraction of width and height."""
+        """Largest displacement that was seen, as a fraction of the longer side."""
         return float(self.displacement.max(initial=0.0))
 
 
@@ -54,7 +57,7 @@ def choose_keyframes(
     """Choose keyframes of grey frames (H, W) in order of time, each with a mask (H, W) of what is no part of the scene.
 
     They are the first, one whenever points have moved by `parallax`, and the last where it adds a view. Motion counts
-    as a fraction of the width sideways and of the height upwards: either takes as much of the overlap.
+    as a fraction of the longer side, or of 4/3 of the shorter one where that is less.
     """
     tracker = _Tracker()
     keyframes: list[int] = []
@@ -91,7 +94,7 @@ class _Tracker:
         return self._started
 
     def advance(self, gray: NDArray[np.uint8]) -> tuple[float, float]:
-        """Median displacement since the keyframe (fraction of width and height), and the share of its tracks alive."""
+        """Median displacement since the keyframe (fraction of the longer side), and the share of its tracks alive."""
         previous, self._previous = self._previous, gray
         if previous is None:
             return 0.0, 1.0
@@ -104,8 +107,8 @@ class _Tracker:
         survivors = len(self._points) / self._started
         if len(self._points) < min(_MIN_TRACKS, self._started):
             return np.inf, survivors
-        distance = np.linalg.norm((self._points - self._origin) / gray.shape[::-1], axis=1)
-        return float(np.median(distance)), survivors
+        distance = np.linalg.norm(self._points - self._origin, axis=1)
+        return float(np.median(distance)) / min(max(gray.shape), _WIDE * min(gray.shape)), survivors
 
 
 def selected_image_path(context: StageContext, name: str) -> Path:

@@ -126,12 +126,13 @@ class FramesStage:
 
     def _choose(self, frames: list[Frame]) -> KeyframeChoice:
         """Places by what is seen of them: of panoramas the level sides, two by two in one picture."""
-        across = 2 if len(self.rig) > 1 else 1
+        # Two square sides in one picture: by their own length, which is 3/4 of what counts for the picture.
+        across = 4 / 3 if len(self.rig) > 1 else 1.0
         places = frames[: self.rig.stations]
 
         def pictures() -> Iterator[Picture]:
             for frame in self.context.progress.track(places, "keyframes", len(places)):
-                if across == 1:
+                if len(self.rig) == 1:
                     yield self.masks.grey(frame)
                     continue
                 sides = [self.masks.grey(frames[i]) for i in self.rig.frames_of([frame.id])]

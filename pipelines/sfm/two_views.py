@@ -229,8 +229,8 @@ _FINE_FACTORS = np.geomspace(0.85, 1.18, 9)
 
 
 def require_motion(largest_displacement: float, has_detail: bool) -> None:
-    """Raise InputError for a camera that does not move, displacement as a fraction of the image's width and
-    height, and for images without detail."""
+    """Raise InputError for a camera that does not move, displacement as a fraction of the image's longer
+    side, and for images without detail."""
     if not has_detail:
         raise InputError(
             "no image shows detail that could be followed into another one: they are dark, of plain surfaces, or out "
@@ -239,7 +239,7 @@ def require_motion(largest_displacement: float, has_detail: bool) -> None:
     if largest_displacement < _MOVING_FRACTION:
         raise InputError(
             f"there is no parallax: over the whole source the image moves by at most {largest_displacement:.2%} of "
-            f"its width or height, so no depth can be found. Either the camera stands still, or the images are all the "
+            f"its longer side, so no depth can be found. Either the camera stands still, or the images are all the "
             f"same: look at them. {HOW_TO_FILM}"
         )
 
