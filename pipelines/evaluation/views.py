@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ...formats.glb import TexturedMesh
 from ..providers import class_colors
-from ..render.api import render_all
-from ..render.gaussian_map import GaussianMap
+from ..render.api import median_depth, render
+from ..render.gaussian_map import GaussianMap, decided_channels
 from ..run.outcome import Exposure, Outcome, labels_of_channels, spread_sample
 from ..system.raster import draw_faces
 from ..types import VOID, Array, ClassTable, Intrinsics
@@ -40,20 +40,27 @@ class MapView:
         return np.round(np.clip(color, 0, 1) * 255).astype(np.uint8)
 
 
+@torch.no_grad()
 def view_map(
     gaussian_map: GaussianMap,
     label_of_channel: NDArray[np.uint8],
     intrinsics: Intrinsics,
     cam_from_world: NDArray[np.float64],
 ) -> MapView:
-    """Draw the map from `cam_from_world` (4, 4). The depth is that of the surface at which half the light is lost."""
-    seen = render_all(gaussian_map, torch.as_tensor(cam_from_world, dtype=torch.float64), intrinsics)
-    coverage = seen.silhouette.cpu().numpy()
+    """Draw the map from `cam_from_world` (4, 4). The depth is that of the surface at which half the light is lost; a
+    label is the class with the largest blended logit."""
+    m = gaussian_map
+    pose = torch.as_tensor(cam_from_world, dtype=torch.float64, device=m.means.device)
+    features = torch.cat([m.colors, m.class_logits], dim=1)
+    drawn = render(m.means, m.radii, m.opacities, features, pose, intrinsics)
+    depth = median_depth(m, pose, intrinsics).cpu().numpy()
+    coverage = drawn.silhouette.cpu().numpy()
     solid = coverage >= _SEEN
+    channels = decided_channels(drawn.features[..., 3:]).cpu().numpy()
     return MapView(
-        color=seen.colors.clamp(0, 1).cpu().numpy().astype(np.float32),
-        depth=np.where(solid, seen.median.cpu().numpy(), 0).astype(np.float32),
-        labels=labels_of_channels(np.where(solid, seen.channels.cpu().numpy(), -1), label_of_channel),
+        color=drawn.features[..., :3].clamp(0, 1).cpu().numpy().astype(np.float32),
+        depth=np.where(solid, depth, 0).astype(np.float32),
+        labels=labels_of_channels(np.where(solid, channels, -1), label_of_channel),
         coverage=coverage.astype(np.float32),
     )
 
