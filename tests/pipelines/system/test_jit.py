@@ -87,7 +87,7 @@ def test_a_kernel_follows_what_other_files_put_into_it(tmp_path):
     (room / "system").mkdir(parents=True)
     for name in ("__init__", "jit", "identity"):
         shutil.copyfile(ROOT / "pipelines" / "system" / f"{name}.py", room / "system" / f"{name}.py")
-    for name in ("__init__", "errors", "names", "reading"):
+    for name in ("__init__", "errors", "reading"):
         (room.parent / "formats").mkdir(exist_ok=True)
         shutil.copyfile(ROOT / "formats" / f"{name}.py", room.parent / "formats" / f"{name}.py")
     (room.parent / "__init__.py").write_text("")
