@@ -84,13 +84,13 @@ def room_cases(seed: int, folder: Path, device: str = "cpu") -> list[tuple[Compl
         shutil.rmtree(maps, ignore_errors=True)
     truths = [half_truth(clip.truth[k]) for k in kept]
     return [
-        (case, _scaled(case, truth) if as_worn else truth)
+        (case, scaled(case, truth) if as_worn else truth)
         for case, truth in zip(cases, truths, strict=True)
         if case is not None and len(case.found.pixels) >= _LEAST_PIXELS
     ]
 
 
-def _scaled(case: CompletionInputs, truth: Array) -> Array:
+def scaled(case: CompletionInputs, truth: Array) -> Array:
     """The truth in the unit of the stereo: one scale for each view, as a run has one."""
     sure = (case.own.confidence >= SURE) & (truth > 0)
     return np.asarray(truth / np.median((truth * case.own.inverse)[sure]), np.float32) if sure.any() else truth * 0

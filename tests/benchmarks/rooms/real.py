@@ -1,0 +1,169 @@
+"""The completion network before real cameras: how good it is there, and learning on from recordings with true depth.
+
+    python -m tests.benchmarks.rooms.real cases DIR RUN=TRUTH ...        runs of `shape.py --recordings`, to DIR/NAME
+    python -m tests.benchmarks.rooms.real judge DIR [NAME ...] [--weights NPZ]
+    python -m tests.benchmarks.rooms.real learn DIR NAME ... --made ROOMS --out NPZ [--steps 700]
+
+A case is a keyframe's evidence and true depth, in the unit of the stereo by one scale for each keyframe. `judge` says
+of the pixels without a sure match: mean |log depth ratio| (at most 1), share off by more than 5 %, true over expected
+error where less than 4 % is expected. `learn` starts from the weights that come with the program, with their
+statistics of batches; every second step is of a recording, the others of the rooms of `rooms learn`. With one thread
+the same files give the same bytes. What ships may learn only from recordings whose licence allows it; the others
+judge.
+"""
+
+import argparse
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shape import true_depths
+
+from msgs_slam.formats.tensors import load_arrays, save_arrays
+from msgs_slam.pipelines.depth.completion import network as completion
+from msgs_slam.pipelines.depth.completion.network import CompletionNetwork, mixture_median
+from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
+from msgs_slam.pipelines.geometry.camera import resample_nearest
+from msgs_slam.pipelines.providers import Sequence
+from msgs_slam.pipelines.proxy.selection import STEREO_PLANES
+from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES
+from msgs_slam.pipelines.run.folder import RunFolder
+from msgs_slam.pipelines.run.settings import load_config
+from msgs_slam.pipelines.system.progress import SilentProgress
+
+from .learning import Example, example_arrays, half_truth, loss_of, scaled
+
+_MOST, _LEAST_PIXELS = 28, 200
+"""Keyframes of a recording, and pixels of one whose truth is known."""
+_BATCH, _RATE, _WARMED = 2, 6e-4, 0.05
+_SURE, _OFF = 0.04, math.log(1.05)
+
+
+def leave_cases(run: RunFolder, truth: Path, target: Path) -> None:
+    """Leave a file for each of at most `_MOST` keyframes with truth, as of both rounds of the completion."""
+    calibration, config = run.load(CALIBRATION), load_config().proxy
+    camera = calibration.intrinsics.at_most(config.max_side)
+    sequence = Sequence(run.load(FRAMES), calibration, camera, run.load(BACKBONE), run.image)
+    matches = target / "stereo"
+    matches.mkdir(parents=True, exist_ok=True)
+    stereo = MultiviewDepth(sequence, config.stereo_side, STEREO_PLANES, lambda: matches, 1, SilentProgress())
+    stereo.precompute(sequence.frames)
+    truths, index = true_depths(run, truth), {int(f): k for k, f in enumerate(run.load(BACKBONE).frame_ids)}
+    known = [i for i in index if i in truths]
+    for i in known[:: -(-len(known) // _MOST)]:
+        full = resample_nearest(truths[i].astype(np.float32), stereo.camera.height, stereo.camera.width)
+        for round_, inputs in enumerate((stereo.first_inputs(index[i]), stereo.inputs(index[i]))):
+            if inputs is not None:
+                arrays = example_arrays(inputs, scaled(inputs, half_truth(full)))
+                save_arrays(target / f"{i:06d}_{round_}.npz", arrays, compress=False)
+
+
+def load_cases(folder: Path, pattern: str = "*_[01].npz") -> list[Example]:
+    """Load those of a recording, or of a made room, in the order of their names; each counts alike."""
+    return [e for e in map(_read, sorted(folder.glob(pattern))) if (~e.wanted.isnan()).sum() >= _LEAST_PIXELS]
+
+
+def _read(path: Path) -> Example:
+    e = Example.of(load_arrays(path), "cpu")
+    given = replace(e.given, planes=e.given.planes.float(), logs=e.given.logs.float(), pixels=e.given.pixels.long())
+    return replace(e, given=given, weight=1.0)
+
+
+def load_weights(path: Path | None) -> CompletionNetwork:
+    """Load weights, those of the program by default, with layers as they learn."""
+    network = CompletionNetwork()
+    arrays = load_arrays(path or completion.WEIGHTS)
+    network.load_state_dict({k: torch.from_numpy(v.astype(np.float32)) for k, v in arrays.items()}, strict=False)
+    return network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+def judge(network: CompletionNetwork, cases: list[Example]) -> tuple[float, float, float]:
+    """Return error and share off of unsure pixels, and true over expected error of those expected to be good."""
+    errors, expected = [], []
+    for case in cases:
+        logs, risk = mixture_median(network.evaluate(case.given))
+        known = ~case.wanted.isnan()
+        errors.append((logs - case.wanted).abs()[known].clamp(max=1).numpy())
+        expected.append(risk[known].numpy())
+    error, risk = np.concatenate(errors), np.concatenate(expected)
+    sure = risk < _SURE
+    return float(error.mean()), float((error > _OFF).mean()), float(error[sure].mean() / max(risk[sure].mean(), 1e-9))
+
+
+def learn(cases: dict[str, list[Example]], made: list[Example], steps: int) -> CompletionNetwork:
+    """Learn on; see the top of this file."""
+    torch.manual_seed(0)
+    rng, network = np.random.default_rng(0), load_weights(None)
+    optimizer = torch.optim.AdamW(network.parameters(), _RATE, weight_decay=2e-3)
+    rooms: dict[tuple[int, ...], list[Example]] = {}
+    for e in made:
+        rooms.setdefault(tuple(e.given.planes.shape[1:]), []).append(e)
+    groups = [list(cases.values()), [g for g in rooms.values() if len(g) >= _BATCH]]
+    for step in range(steps):
+        kind = groups[step % 2] or groups[0]
+        share = np.array([1.0 if kind is groups[0] else len(g) for g in kind])
+        group = kind[rng.choice(len(kind), p=share / share.sum())]
+        batch = [group[i] for i in rng.choice(len(group), _BATCH, replace=False)]
+        batch = [e.mirrored() if rng.random() < 0.5 else e for e in batch]
+        part = step / steps
+        rate = part / _WARMED if part < _WARMED else 0.5 * (1 + math.cos(math.pi * (part - _WARMED) / (1 - _WARMED)))
+        for values in optimizer.param_groups:
+            values["lr"] = max(_RATE * rate, 1e-6)
+        optimizer.zero_grad(set_to_none=True)
+        loss = loss_of(network, batch)
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimizer.step()
+        if step % 50 == 49:
+            print(f"{step + 1} steps", flush=True)
+    return network
+
+
+def save_weights(network: CompletionNetwork, path: Path) -> None:
+    """Write them as they come with the program."""
+    arrays = {k: v.numpy() for k, v in network.state_dict().items() if not k.endswith("num_batches_tracked")}
+    save_arrays(path, {k: v if "running" in k else v.astype(np.float16) for k, v in arrays.items()})
+
+
+def table(folder: Path, names: list[str], weights: Path | None) -> None:
+    """Print a row a recording, by the second round."""
+    network, errors = load_weights(weights), []
+    for name in names or sorted(p.name for p in folder.iterdir() if p.is_dir()):
+        error, off, ratio = judge(network, load_cases(folder / name, "*_1.npz"))
+        errors.append(error)
+        print(f"{name:24} error {error:.4f}  off {100 * off:.0f} %  true / expected {ratio:.2f}", flush=True)
+    print(f"{'mean':24} error {np.mean(errors):.4f}")
+
+
+def main() -> None:
+    """Parse, do."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("cases", "judge", "learn"))
+    parser.add_argument("folder", type=Path, metavar="DIR")
+    parser.add_argument("names", nargs="*", metavar="NAME")
+    parser.add_argument("--weights", type=Path, metavar="NPZ")
+    parser.add_argument("--made", type=Path, metavar="ROOMS", help="folder of `rooms learn`")
+    parser.add_argument("--out", type=Path, metavar="NPZ")
+    parser.add_argument("--steps", type=int, default=700)
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    if given.what == "cases":
+        for run, truth in (pair.split("=") for pair in given.names):
+            leave_cases(RunFolder(Path(run)), Path(truth), given.folder / Path(run).stem)
+    elif given.what == "judge":
+        table(given.folder, given.names, given.weights)
+    else:
+        made = load_cases(given.made / "examples", "[0-9]*.npz") if given.made else []
+        save_weights(learn({n: load_cases(given.folder / n) for n in given.names}, made, given.steps), given.out)
+
+
+if __name__ == "__main__":
+    main()
