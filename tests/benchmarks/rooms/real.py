@@ -31,7 +31,7 @@ from msgs_slam.pipelines.depth.completion import network as completion
 from msgs_slam.pipelines.depth.completion.network import CompletionNetwork, mixture_median
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.geometry.camera import resample_nearest
-from msgs_slam.pipelines.providers import Sequence
+from msgs_slam.pipelines.geometry.sequence import Sequence
 from msgs_slam.pipelines.proxy.selection import STEREO_PLANES
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
