@@ -79,7 +79,7 @@ class Headers:
     def warn(self, warn: Callable[[str], None]) -> None:
         """Report images of several makes or models, which are treated as one camera, files of several images, unusable
         colour profiles, and images left out for their size."""
-        width, height = next(iter(self.of.values())).size
+        width, height = next((h.size for h in self.of.values()), (0, 0))  # a container has no files
         odd = [f"{name} ({w}x{h})" for name, (w, h) in self.odd.items()]
         unusable = [name for name, header in self.of.items() if header.colours == UNUSABLE]
         several = [f"{name} ({header.images})" for name, header in self.of.items() if header.images > 1]

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.video import VideoFrame
-from ..sfm.flow import find_corners, follow
 
 _TIME_SLACK = 1e-6
 """Seconds: a frame due exactly at a window's start must not fall into the window before by rounding."""
@@ -125,6 +124,8 @@ class Motion:
 def _moved(images: list[NDArray[np.uint8]]) -> float:
     """Way of things through images in a row (fraction of the longer side), as the sum of the medians over corners; 0
     where there are none, infinite where they are lost from one image to the next."""
+    from ..sfm.flow import find_corners, follow  # numba, which what only checks a source does without
+
     way, points = 0.0, np.zeros((0, 2))
     for before, after in itertools.pairwise(images):
         if len(points) < _FEWEST:

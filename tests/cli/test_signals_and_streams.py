@@ -13,7 +13,7 @@ from cli_runs import FinishedRun, invoke
 
 from msgs_slam.formats.errors import DiskFullError
 from msgs_slam.formats.video_streams import write_video
-from msgs_slam.pipelines.run import folder, runner
+from msgs_slam.pipelines.run import runner
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.runner import forget_peak, peak_memory_mb
 from msgs_slam.pipelines.system.progress import Stopped, is_asked, soft_stop, stop_if_asked
@@ -61,7 +61,7 @@ def test_sigterm_ends_softly_and_the_run_goes_on_to_the_same_bytes(copied_run: C
     assert (stopped / "mapping.partial" / "snapshot" / "submaps_1" / "made_state_0000.safetensors").exists()
     for run in (stopped, whole):
         assert invoke("resume", run, *change, "-q").exit_code == 0
-    found, expected = (folder.load_records(RunFolder(r)) for r in (stopped, whole))
+    found, expected = (RunFolder(r).records for r in (stopped, whole))
     assert {n: r.content for n, r in found.items()} == {n: r.content for n, r in expected.items()}
 
 
