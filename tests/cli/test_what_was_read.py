@@ -83,7 +83,7 @@ def world(finished_run: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -
     (given / "net").mkdir()
     save_network(given / "net" / "net.onnx", PICTURE, "float[1, 3, H, W] y", "y = Mul (x, gain)", gain=[2.0])
     (given / "net" / "card.toml").write_text(LABELS)
-    settings = [x for s in (*QUICK, "frames.parallax=0.2") for x in ("--set", s)]
+    settings = [x for s in (*QUICK, "frames.parallax=0.16") for x in ("--set", s)]
     options = ("--poses", given / "poses.txt", "--intrinsics", given / "camera.txt", "--masks", given / "masks")
     proxies = ("--depth", f"files:{given / 'depth'}", "--semantics", f"onnx:{given / 'net' / 'card.toml'}")
     run_one = runner._run_one
