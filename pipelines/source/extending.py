@@ -59,18 +59,19 @@ def require_extendable(run: RunFolder, videos: Sequence[Path], config: Config) -
         "from panoramas": not unfinished and run.load(CALIBRATION).directions > 1,
     }
     if odd := next((how for how, holds in made.items() if holds), None):
+        known = "" if made["with --method paper"] else f", with --poses {quoted(run.path('export', 'sparse', '0'))}"
         raise InputError(
             f"{run.root} was made {odd}: only runs of ordinary videos without given poses are extended. Reconstruct "
-            f"all of it into another folder, with --poses {quoted(run.path('export', 'sparse', '0'))}"
+            f"all of it into another folder{known}"
         )
     if unfinished:
         raise InputError(f"{run.root}: {unfinished[0]} is not done. Run `msgs-slam resume {quoted(run.root)}` first")
     require_different(videos)
     require_listable(videos)
-    known = video_files(source)
-    width, height = _size(known[0])
+    files = video_files(source)
+    width, height = _size(files[0])
     for video in videos:
-        if video.resolve() in [file.resolve() for file in known]:
+        if video.resolve() in [file.resolve() for file in files]:
             raise InputError(f"{video} is part of {run.root} already: give another one")
         if _size(video) != (width, height):
             raise InputError(

@@ -1,8 +1,8 @@
 """The completion network before real cameras: how good it is there, and learning on from recordings with true depth.
 
-    python -m tests.benchmarks.rooms.real cases DIR RUN=TRUTH ...        runs of `shape.py --recordings`, to DIR/NAME
-    python -m tests.benchmarks.rooms.real judge DIR [NAME ...] [--weights NPZ]
-    python -m tests.benchmarks.rooms.real learn DIR NAME ... --made ROOMS --out NPZ [--steps 700]
+    python tests/benchmarks/real_depth.py cases DIR RUN=TRUTH ...        runs of `shape.py --recordings`, to DIR/NAME
+    python tests/benchmarks/real_depth.py judge DIR [NAME ...] [--weights NPZ]
+    python tests/benchmarks/real_depth.py learn DIR NAME ... --made ROOMS --out NPZ [--steps 700]
 
 A case is a keyframe's evidence and true depth, in the unit of the stereo by one scale for each keyframe. `judge` says
 of the pixels without a sure match: mean |log depth ratio| (at most 1), share off by more than 5 %, true over expected
@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from shape import true_depths
 
@@ -37,8 +37,7 @@ from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.system.progress import SilentProgress
-
-from .learning import Example, example_arrays, half_truth, loss_of, scaled
+from tests.benchmarks.rooms.learning import Example, example_arrays, half_truth, loss_of, scaled
 
 _MOST, _LEAST_PIXELS = 28, 200
 """Keyframes of a recording, and pixels of one whose truth is known."""
