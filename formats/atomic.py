@@ -100,10 +100,25 @@ def temporary_of(path: Path) -> Path:
     return path.with_name(name)
 
 
+@contextmanager
+def temporary_folder(path: Path) -> Iterator[Path]:
+    """Yield an empty folder named as the temporary file of `path`, and remove it; what a killed process left goes."""
+    folder = temporary_of(path)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def remove_temporaries(folder: Path) -> None:
-    """Remove the temporary files that killed processes have left below a folder."""
+    """Remove the temporary files and folders that killed processes have left below a folder."""
     for path in list(folder.rglob(".*.tmp*")):
-        path.unlink(missing_ok=True)
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def write_bytes(path: Path, data: bytes | bytearray | memoryview) -> None:

@@ -9,13 +9,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .atomic import atomic_path, explained
+from .atomic import atomic_path, explained, temporary_folder
 from .errors import InputError
 from .reading import noting_files, opened, parsing, read_bytes, require_file
 from .trajectory import FARTHEST, nearest_rotation, poses_from_quaternions
@@ -150,15 +149,15 @@ def write_colmap_model(folder: Path, model: ColmapModel) -> None:
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=folder) as made:
+        with temporary_folder(folder / "model") as made:
             reconstruction = _reconstruction(model)
             reconstruction.write_text(made)
             reconstruction.write_binary(made)
-            _require_written(Path(made), model)
+            _require_written(made, model)
             # Binary last: readers look for it first, and must not find it before the rest is there.
             for name in (f"{part}{suffix}" for suffix in (".txt", ".bin") for part in _PARTS):
                 with atomic_path(folder / name) as temporary:
-                    os.replace(Path(made, name), temporary)
+                    os.replace(made / name, temporary)
     except OSError as error:
         raise explained(error, folder / "images.bin") from error
 

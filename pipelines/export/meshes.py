@@ -1,6 +1,5 @@
 """The mesh of a run for engines: collision.glb to walk in, with a floor without holes, and USDZ in true size."""
 
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from ...formats.atomic import atomic_path, require_room
+from ...formats.atomic import atomic_path, require_room, temporary_folder
 from ...formats.errors import InputError, install_extra
 from ...formats.glb import Part, TexturedMesh, linear, material, write_primitive
 from ...formats.images import write_rgb
@@ -69,15 +68,15 @@ def write_usdz(
     from pxr import Usd, UsdGeom, UsdUtils
 
     require_room(path, 2 * 24 * len(mesh.vertices))  # a layer, and the package with a copy of it
-    with atomic_path(path) as temporary, tempfile.TemporaryDirectory(dir=temporary.parent) as scratch:
-        stage = Usd.Stage.CreateNew(str(layer := Path(scratch) / "mesh.usdc"))
+    with atomic_path(path) as temporary, temporary_folder(path.with_suffix("")) as scratch:
+        stage = Usd.Stage.CreateNew(str(layer := scratch / "mesh.usdc"))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(stage, metres_per_unit)
         root = UsdGeom.Xform.Define(stage, "/Scene")
         stage.SetDefaultPrim(root.GetPrim())
         shape = UsdGeom.Mesh.Define(stage, "/Scene/Mesh")
         if isinstance(mesh, TexturedMesh):
-            write_rgb(Path(scratch) / _TEXTURE, mesh.texture)
+            write_rgb(scratch / _TEXTURE, mesh.texture)
             corner = mesh.corner_vertex
             _fill(shape, mesh.vertices[corner] @ turn.T, mesh.faces, mesh.labels[corner], names)
             _paint(stage, shape, _add_texture(stage, shape, mesh.corner_uv))
@@ -85,7 +84,7 @@ def write_usdz(
             _fill(shape, mesh.vertices @ turn.T, mesh.faces, mesh.labels, names)
             _paint(stage, shape, _add_colors(stage, shape, mesh.colors))
         stage.Save()
-        package = Path(scratch) / USD
+        package = scratch / USD
         UsdUtils.CreateNewUsdzPackage(str(layer), str(package))
         package.replace(temporary)
 

@@ -80,7 +80,10 @@ def test_pycolmap_reads_both_kinds(tmp_path: Path, kind: str, noise: float) -> N
 
 def test_written_files_are_the_same_every_time(tmp_path: Path) -> None:
     write_colmap_model(tmp_path / "a", _scene())
+    (left := tmp_path / "b" / ".model.tmp").mkdir(parents=True)  # by a process that was killed
+    (left / "cameras.bin").write_bytes(b"half")
     write_colmap_model(tmp_path / "b", _scene())
+    assert not left.exists()
     names = sorted(p.name for p in (tmp_path / "a").iterdir())
     assert names == [f"{n}{s}" for n in ("cameras", "images", "points3D") for s in (".bin", ".txt")]
     assert all((tmp_path / "a" / n).read_bytes() == (tmp_path / "b" / n).read_bytes() for n in names)
