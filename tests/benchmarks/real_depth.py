@@ -37,7 +37,16 @@ from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.system.progress import SilentProgress
-from tests.benchmarks.rooms.learning import Example, example_arrays, half_truth, loss_of, scaled
+from tests.benchmarks.rooms.learning import (
+    Example,
+    example_arrays,
+    half_truth,
+    load_weights,
+    loss_of,
+    rate_at,
+    save_weights,
+    scaled,
+)
 
 _MOST, _LEAST_PIXELS = 28, 200
 """Keyframes of a recording, and pixels of one whose truth is known."""
@@ -75,11 +84,10 @@ def _read(path: Path) -> Example:
     return replace(e, given=given, weight=1.0)
 
 
-def load_weights(path: Path | None) -> CompletionNetwork:
+def network_of(weights: Path | None) -> CompletionNetwork:
     """Load weights, those of the program by default, with layers as they learn."""
     network = CompletionNetwork()
-    arrays = load_arrays(path or completion.WEIGHTS)
-    network.load_state_dict({k: torch.from_numpy(v.astype(np.float32)) for k, v in arrays.items()}, strict=False)
+    load_weights(network, weights or completion.WEIGHTS)
     return network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
@@ -99,7 +107,7 @@ def judge(network: CompletionNetwork, cases: list[Example]) -> tuple[float, floa
 def learn(cases: dict[str, list[Example]], made: list[Example], steps: int) -> CompletionNetwork:
     """Learn on; see the top of this file."""
     torch.manual_seed(0)
-    rng, network = np.random.default_rng(0), load_weights(None)
+    rng, network = np.random.default_rng(0), network_of(None)
     optimizer = torch.optim.AdamW(network.parameters(), _RATE, weight_decay=2e-3)
     rooms: dict[tuple[int, ...], list[Example]] = {}
     for e in made:
@@ -111,10 +119,8 @@ def learn(cases: dict[str, list[Example]], made: list[Example], steps: int) -> C
         group = kind[rng.choice(len(kind), p=share / share.sum())]
         batch = [group[i] for i in rng.choice(len(group), _BATCH, replace=False)]
         batch = [e.mirrored() if rng.random() < 0.5 else e for e in batch]
-        part = step / steps
-        rate = part / _WARMED if part < _WARMED else 0.5 * (1 + math.cos(math.pi * (part - _WARMED) / (1 - _WARMED)))
         for values in optimizer.param_groups:
-            values["lr"] = max(_RATE * rate, 1e-6)
+            values["lr"] = max(_RATE * rate_at(step / steps, _WARMED), 1e-6)
         optimizer.zero_grad(set_to_none=True)
         loss = loss_of(network, batch)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -125,15 +131,9 @@ def learn(cases: dict[str, list[Example]], made: list[Example], steps: int) -> C
     return network
 
 
-def save_weights(network: CompletionNetwork, path: Path) -> None:
-    """Write them as they come with the program."""
-    arrays = {k: v.numpy() for k, v in network.state_dict().items() if not k.endswith("num_batches_tracked")}
-    save_arrays(path, {k: v if "running" in k else v.astype(np.float16) for k, v in arrays.items()})
-
-
 def table(folder: Path, names: list[str], weights: Path | None) -> None:
     """Print a row a recording, by the second round."""
-    network, errors = load_weights(weights), []
+    network, errors = network_of(weights), []
     for name in names or sorted(p.name for p in folder.iterdir() if p.is_dir()):
         error, off, ratio = judge(network, load_cases(folder / name, "*_1.npz"))
         errors.append(error)

@@ -258,7 +258,7 @@ def learn(folder: Path, seeds: range, seconds: float, workers: int, start: Path 
     (folder / "examples").mkdir(parents=True, exist_ok=True)
     network = CompletionNetwork()
     if start is not None:
-        network.load_state_dict(_tensors(start), strict=False)
+        load_weights(network, start)
     with closing(Examples(folder / "examples", device)) as examples:
         fit = Fit(network.to(device), examples, seconds, 0.5 if start else 1.0)
         if state.exists():
@@ -274,13 +274,26 @@ def learn(folder: Path, seeds: range, seconds: float, workers: int, start: Path 
         save_arrays(state, fit.state())
         return None
     state.unlink(missing_ok=True)
-    states = {k: v.cpu().numpy() for k, v in network.state_dict().items() if not k.endswith("num_batches_tracked")}
-    save_arrays(target, {k: v if "running" in k else v.astype(np.float16) for k, v in states.items()})
+    save_weights(network, target)
     return target
 
 
-def _tensors(weights: Path) -> dict[str, Tensor]:
-    return {k: torch.from_numpy(v.astype(np.float32)) for k, v in load_arrays(weights).items()}
+def load_weights(network: CompletionNetwork, path: Path) -> None:
+    """Load what `save_weights` wrote."""
+    arrays = load_arrays(path)
+    network.load_state_dict({k: torch.from_numpy(v.astype(np.float32)) for k, v in arrays.items()}, strict=False)
+
+
+def save_weights(network: CompletionNetwork, path: Path) -> None:
+    """Write weights as they come with the program."""
+    states = {k: v.cpu().numpy() for k, v in network.state_dict().items() if not k.endswith("num_batches_tracked")}
+    save_arrays(path, {k: v if "running" in k else v.astype(np.float16) for k, v in states.items()})
+
+
+def rate_at(part: float, warmed: float) -> float:
+    """Return the share of the largest rate at a part of the learning: it grows until `warmed`, then falls as a cosine
+    does."""
+    return part / warmed if part < warmed else 0.5 * (1 + math.cos(math.pi * (part - warmed) / (1 - warmed)))
 
 
 class Fit:
@@ -333,10 +346,8 @@ class Fit:
         return True
 
     def _step(self, batch: list[Example]) -> Tensor:
-        part = self.done / self._seconds
-        rate = part / 0.04 if part < 0.04 else 0.5 * (1 + math.cos(math.pi * (part - 0.04) / 0.96))
         for group in self._optimizer.param_groups:
-            group["lr"] = max(self._rate * rate, 1e-6)
+            group["lr"] = max(self._rate * rate_at(self.done / self._seconds, 0.04), 1e-6)
         self._optimizer.zero_grad(set_to_none=True)
         with torch.autocast(self._device, dtype=torch.bfloat16, enabled=self._device == "cuda"):
             loss = loss_of(self.network, batch)
