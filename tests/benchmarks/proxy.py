@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tracking import write_noisy_depth
 
+from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.image_folder import natural_key
 from msgs_slam.formats.images import read_depth_png
 from msgs_slam.pipelines.geometry.camera import project, resample_nearest, unproject_depth
@@ -68,32 +69,30 @@ class TimedProgress(SilentProgress):
 
 @dataclass(frozen=True)
 class Case:
-    """A folder of pictures with true depth: the kitchen's is that of another camera with focal length `zoom` x."""
+    """A folder of pictures with true depth, by `suffix` in place of theirs, or the data set that has both."""
 
     pictures: Path
     depth: Path
     glob: str = "*"
     suffix: str = ".png"
-    zoom: float = 1.0
+    is_set: bool = False
 
     def truth(self, name: str, width: int, height: int) -> NDArray[np.float32]:
         """(h, w) metres of the picture `name`, 0 = unknown."""
-        stored = read_depth_png(self.depth / (name.split(".")[0] + self.suffix)).astype(np.float32) / 1000
-        stored[stored > 60] = 0
-        if self.zoom != 1:
-            x, y = np.meshgrid(np.arange(stored.shape[1]) + 0.5, np.arange(stored.shape[0]) + 0.5)
-            centre = np.array(stored.shape[::-1]) / 2
-            column, row = (((a - c) * self.zoom + c).astype(int) for a, c in zip((x, y), centre, strict=True))
-            inside = (column >= 0) & (row >= 0) & (column < stored.shape[1]) & (row < stored.shape[0])
-            stored = np.where(inside, stored[np.where(inside, row, 0), np.where(inside, column, 0)], 0)
+        if self.is_set:
+            sequence = open_sequence(self.depth)
+            stored = sequence.depth(sequence.names.index(name))
+            assert stored is not None
+        else:
+            stored = read_depth_png(self.depth / (name.split(".")[0] + self.suffix)).astype(np.float32) / 1000
+            stored[stored > 60] = 0
         return resample_nearest(stored.astype(np.float32), height, width)
 
 
 CASES = {
     "replica": Case(DATA / "replica_office0" / "rgb", DATA / "replica_office0" / "depth"),
     "whiteroom": Case(DATA / "whiteroom" / "rgb", DATA / "whiteroom" / "depth"),
-    # Colour 525, depth 585 pixels; the few centimetres between the two cameras are left out.
-    "kitchen": Case(DATA / "kitchen", DATA / "kitchen", "*.color.jpg", ".depth.png", 585 / 525),
+    "kitchen": Case(DATA / "kitchen", DATA / "kitchen", "*.color.jpg", is_set=True),
 }
 VIDEOS = {
     "kitchen": DATA / "videos" / "kitchen_640x480_30fps.mp4",
