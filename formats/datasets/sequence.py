@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,16 @@ class LabelClass:
         return self.name.strip().lower() in _VOID_NAMES
 
 
+class FrameStore(Protocol):
+    """Frames stored in one container file instead of a folder."""
+
+    def rgb(self, index: int, /) -> NDArray[np.uint8]:
+        """Return (H, W, 3) uint8."""
+
+    def raw_depth(self, index: int, /) -> NDArray[np.uint16]:
+        """Return (H, W) uint16 in the container's unit."""
+
+
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """N frames of one camera.
@@ -84,7 +94,7 @@ class Dataset:
     label_paths: tuple[Path | None, ...] = ()
     mask_paths: tuple[Path | None, ...] = ()
     classes: tuple[LabelClass, ...] = ()
-    store: Any = field(default=None, repr=False)
+    store: FrameStore | None = field(default=None, repr=False)
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
