@@ -283,12 +283,12 @@ def adjustment_timed() -> Iterator[list[float]]:
 
         return call
 
-    plain = stage.adjust_state, candidates.adjust
-    stage.adjust_state, candidates.adjust = timed(plain[0]), timed(plain[1])
+    plain = stage.adjust_state, candidates.adjust_model
+    stage.adjust_state, candidates.adjust_model = timed(plain[0]), timed(plain[1])
     try:
         yield spent
     finally:
-        stage.adjust_state, candidates.adjust = plain
+        stage.adjust_state, candidates.adjust_model = plain
 
 
 def walk_case(name: str, work: Path) -> Case:
