@@ -13,7 +13,6 @@ READ_ELSEWHERE = {
     "evaluation.truth.ErrorStatistics": "written to evaluation.json as a whole",
     "types.Metres.by_source": "written to scale.json, for people",
     "types.MetresSource": "written to scale.json, for people",
-    "evaluation.views.MapView.coverage": "returned by `Run.draw` of the Python interface",
 }
 """Classes of pipelines/ or fields of theirs that have their reader outside of the program."""
 Classes = frozenset[str]

@@ -5,6 +5,7 @@ to learn from.
     python -m tests.benchmarks.rooms measure DIR NAME --set judge           the product's depth of them, kept as NAME
     python -m tests.benchmarks.rooms table DIR OLD [NEW] --set judge        one against the other
     python -m tests.benchmarks.rooms video DIR --set judge --rooms 4        videos with their truth, DIR/video/SEED
+    python -m tests.benchmarks.rooms walk DIR --set judge --rooms 4         walks through whole homes, DIR/walk/SEED
     python -m tests.benchmarks.rooms learn DIR --seconds 560 --workers 15   the network that completes depth, on a card
     python -m tests.benchmarks.rooms measure DIR NAME --network 6           fused with a network that is off by 6 %
 
@@ -13,7 +14,10 @@ A default about depth is chosen on `choose` and reported on `judge`. A room is a
 walk of 12 keyframes, a camera; 15 CPU seconds each. Needs `pip install embreex`. Poses are those of the walk up to a
 millimetre. "off": wrong by more than 5 %; "unsure": confidence below 0.3 in OLD. `video` takes the kinds of rooms in
 turn; each is a walk of twelve seconds at 640x480 (40 CPU seconds), for `reconstruct DIR/video/SEED/video.mp4` and
-`evaluate --truth DIR/video/SEED --class-map tests/benchmarks/rooms/classes.toml`. `learn` leaves DIR/weights.npz; with
+`evaluate --truth DIR/video/SEED --class-map tests/benchmarks/rooms/classes.toml`. `walk` makes homes of three to six
+rooms, most with a corridor and some with a stair, filmed upright or across in 30 to 90 seconds at 12 images a second,
+in half of them back to where it began (150 CPU seconds); twenty to choose on, twenty to judge on, for `walks.py`. Both
+hold views from half a metre beside the path, for `beside.py`. `learn` leaves DIR/weights.npz; with
 --pause it leaves what the same command goes on from, where a machine is not lent for long enough.
 """
 
@@ -21,6 +25,7 @@ import argparse
 import itertools
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -43,6 +48,7 @@ from .network import NetworkLike
 from .room import KINDS, kind_of
 
 SETS = {"choose": (1000, 40), "judge": (2000, 40), "learn": (30_000, 2000)}
+WALKS = {"choose": (3000, 20), "judge": (4000, 20)}
 """First seed and number of rooms; seeds without a place to walk are passed over."""
 SURE, OFF = 0.3, 0.05
 
@@ -76,13 +82,26 @@ def make_videos(folder: Path, name: str, package: Path | None, most: int) -> Non
     first, count = SETS[name]
     seeds = {kind: iter([s for s in range(first, first + 2 * count) if kind_of(s) == kind]) for kind in KINDS}
     for kind in itertools.islice(itertools.cycle(seeds), most or len(seeds)):
-        for seed in seeds[kind]:
-            start, target = time.process_time(), folder / "video" / str(seed)
-            if target.exists():
-                break
-            if make_video(seed, furniture(str(folder), str(package or "")), target):
-                print(f"{seed} {kind}: {time.process_time() - start:.1f} CPU seconds", flush=True)
-                break
+        next(s for s in seeds[kind] if _made(make_video, s, folder / "video", package))
+
+
+def make_walks(folder: Path, name: str, package: Path | None, most: int) -> None:
+    """Leave walks through the homes of a set."""
+    from .stroll import make_stroll  # imports av
+
+    first, count = WALKS[name]
+    made = (s for s in itertools.count(first) if _made(make_stroll, s, folder / "walk", package))
+    list(itertools.islice(made, min(most or count, count)))
+
+
+def _made(make: Callable[..., bool], seed: int, folder: Path, package: Path | None) -> bool:
+    """Whether the video of a seed is there, or could be made."""
+    start, target = time.process_time(), folder / str(seed)
+    if target.exists():
+        return True
+    if made := make(seed, furniture(str(folder.parent), str(package or "")), target):
+        print(f"{target}: {time.process_time() - start:.1f} CPU seconds", flush=True)
+    return made
 
 
 def measure(folder: Path, seeds: list[int], name: str, network: float, alone: bool) -> None:
@@ -192,7 +211,7 @@ def _print(title: str, rows: list[dict[str, NDArray]], summary: object) -> None:
 def main() -> None:
     """Parse, do."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("make", "measure", "table", "video", "learn"))
+    parser.add_argument("what", choices=("make", "measure", "table", "video", "walk", "learn"))
     parser.add_argument("folder", type=Path, metavar="DIR")
     parser.add_argument("names", nargs="*", metavar="NAME")
     parser.add_argument("--set", choices=SETS, default="choose")
@@ -214,6 +233,8 @@ def main() -> None:
         return print(learn(given.folder, seeds, given.seconds, given.workers, given.start, given.pause))
     if given.what == "video":
         return make_videos(given.folder, given.set, given.package, given.rooms)
+    if given.what == "walk":
+        return make_walks(given.folder, given.set, given.package, given.rooms)
     seeds = seeds_of(given.folder, given.set, given.what == "make", given.package, given.rooms)
     if given.what == "measure":
         measure(given.folder, seeds, *given.names, given.network, given.alone)

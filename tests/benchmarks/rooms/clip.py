@@ -184,7 +184,8 @@ def _path(size: tuple[float, float, float], count: int, r: Random) -> Array:
 def _interesting(room: Room, eye: Array, r: Random) -> float:
     """The direction of a dozen in which most things stand."""
     middles = np.array(
-        [((a + c) / 2, (b + d) / 2) for a, b, c, d in room.taken] + [(room.size[0] / 2, room.size[1] / 2)]
+        [((a + c) / 2, (b + d) / 2) for a, b, c, d in room.taken + room.entries]
+        + [(room.size[0] / 2, room.size[1] / 2)]
     )
     bearing = np.arctan2(middles[:, 1] - eye[2], middles[:, 0] - eye[0])
     far = np.hypot(middles[:, 1] - eye[2], middles[:, 0] - eye[0]) > 1

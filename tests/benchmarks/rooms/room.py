@@ -1,6 +1,7 @@
 """A room by seed: walls, openings, light and furniture, lit and ready to be photographed."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,22 +16,34 @@ KINDS = {"home": 0.55, "office": 0.2, "class": 0.15, "bare": 0.1}
 
 @dataclass
 class Room:
-    """What is known while it is built; `taken` holds (x0, z0, x1, z1) of what stands on the floor, `tops` the frames
-    and sizes of what things can lie on."""
+    """What is known while it is built; `taken` holds (x0, z0, x1, z1) of what stands on the floor, `entries` of what is
+    kept free before doors, `tops` the frames and sizes of what things can lie on. Of a home's room: the `doors` of each
+    of its walls to other rooms, the trim and the walls' material of the home, and where a wall has nothing behind."""
 
     kind: str
     size: tuple[float, float, float]
     surfaces: Surfaces
     catalogue: Catalogue
+    doors: tuple[list[Opening], ...] = ([], [], [], [])
+    trim: Trim | None = None
+    paint: int | None = None
+    is_outside: Callable[[int, Opening], bool] = lambda wall, opening: True
     walls: list[Wall] = field(default_factory=list)
     taken: list[tuple[float, float, float, float]] = field(default_factory=list)
+    entries: list[tuple[float, float, float, float]] = field(default_factory=list)
     tops: list[tuple[Array, float, float, float]] = field(default_factory=list)
 
     def is_free(self, x0: float, z0: float, x1: float, z1: float, gap: float) -> bool:
         """Whether a rectangle of the floor is inside and `gap` away from all that stands there."""
         wide, deep, _ = self.size
         inside = x0 > -0.01 and z0 > -0.01 and x1 < wide + 0.01 and z1 < deep + 0.01
-        return inside and all(x1 + gap < a or x0 - gap > c or z1 + gap < b or z0 - gap > d for a, b, c, d in self.taken)
+        others = self.taken + self.entries
+        return inside and all(x1 + gap < a or x0 - gap > c or z1 + gap < b or z0 - gap > d for a, b, c, d in others)
+
+    def allows(self, wall: int, hole: Opening) -> bool:
+        """Whether a wall has place for a window or door beside those to other rooms."""
+        beside = all(hole.right + 0.3 < d.left or hole.left - 0.3 > d.right for d in self.doors[wall])
+        return beside and ((hole.kind == "door" and self.kind != "stairs") or self.is_outside(wall, hole))
 
 
 def build_room(seed: int, catalogue: Catalogue) -> tuple[Room, Random]:
@@ -41,10 +54,15 @@ def build_room(seed: int, catalogue: Catalogue) -> tuple[Room, Random]:
     if kind == "class":
         size = r.uniform(5.5, 9), r.uniform(6, 10), r.uniform(2.7, 3.6)
     room = Room(kind, size, Surfaces(), catalogue)
+    fill_room(room, r)
+    return room, r
+
+
+def fill_room(room: Room, r: Random) -> None:
+    """Build its walls, light and furniture."""
     _build_shell(room, r)
     _hang_lights(room, r)
     _Furnisher(room, r).furnish()
-    return room, r
 
 
 def kind_of(seed: int) -> str:
@@ -81,7 +99,7 @@ def thing_material(s: Surfaces, r: Random, wooden: float = 0.4) -> int:
 
 def _build_shell(room: Room, r: Random) -> None:
     s, (wide, deep, high) = room.surfaces, room.size
-    one = surface(s, r, "wall")
+    one = surface(s, r, "wall") if room.paint is None else room.paint
     materials = [one if r.random() < 0.8 else surface(s, r, "wall") for _ in range(4)]
     white = s.material(linear(np.full(3, r.uniform(200, 248))))
     ceiling = white if r.random() < 0.7 else surface(s, r, "wall")
@@ -89,17 +107,18 @@ def _build_shell(room: Room, r: Random) -> None:
     s.quad((0, 0, deep), (wide, 0, 0), (0, 0, -deep), surface(s, r, "floor"))
     s.of_class("ceiling")
     s.quad((0, high, 0), (wide, 0, 0), (0, 0, deep), ceiling)
-    trim = _trim(room, r)
+    trim = room.trim or make_trim(room, r)
     corners = ((0, 0, 0), (wide, 0, 0), (wide, 0, deep), (0, 0, deep))
     ways = ((1, 0, 0), (0, 0, 1), (-1, 0, 0), (0, 0, -1))
     for i, (corner, way, length) in enumerate(zip(corners, ways, (wide, deep, wide, deep), strict=True)):
         along, inward = np.array(way, float), np.array(ways[(i + 1) % 4], float)
-        wall = Wall(np.array(corner, float), along, length, inward, _openings(length, high, r))
+        holes = [o for o in _openings(length, high, r) if room.allows(i, o)] + room.doors[i]
+        wall = Wall(np.array(corner, float), along, length, inward, holes)
         build_wall(s, wall, high, materials[i], trim, r)
         room.walls.append(wall)
         _skirting(room, wall, trim, r)
     s.of_class("wall")
-    if r.random() < 0.45:  # a corner block makes the room L-shaped; or a pillar
+    if not any(room.doors) and r.random() < 0.45:  # a corner block makes the room L-shaped; or a pillar
         corner_block = r.random() < 0.6
         shares = (r.uniform(0.3, 0.45) * wide, r.uniform(0.2, 0.45) * deep)
         a, b = shares if corner_block else (r.uniform(0.25, 0.6), r.uniform(0.25, 0.6))
@@ -110,7 +129,8 @@ def _build_shell(room: Room, r: Random) -> None:
         s.box((0, high - r.uniform(0.15, 0.4), deep * 0.5), (wide, high, deep * 0.5 + r.uniform(0.15, 0.4)), ceiling)
 
 
-def _trim(room: Room, r: Random) -> Trim:
+def make_trim(room: Room, r: Random) -> Trim:
+    """Materials of frames, doors and metal, and what is outside."""
     s = room.surfaces
     light = r.uniform(1.5, 6) * np.array([1, 1, 1.05])
     if r.random() < 0.5:
@@ -144,7 +164,7 @@ def _openings(length: float, high: float, r: Random) -> list[Opening]:
 
 def _skirting(room: Room, wall: Wall, trim: Trim, r: Random) -> None:
     """The board along the wall's foot; and doors are kept free."""
-    doors = [h for h in wall.openings if h.kind != "window"]
+    doors = sorted((h for h in wall.openings if h.kind != "window"), key=lambda h: h.left)
     if r.random() < 0.6:
         high, x = r.uniform(0.05, 0.14), 0.0
         room.surfaces.of_class("wall")
@@ -153,7 +173,7 @@ def _skirting(room: Room, wall: Wall, trim: Trim, r: Random) -> None:
             x = right
     for h in doors:
         c = wall.origin + wall.along * (h.left + h.right) / 2 + wall.inward * 0.4
-        room.taken.append((c[0] - 0.45, c[2] - 0.45, c[0] + 0.45, c[2] + 0.45))
+        room.entries.append((c[0] - 0.45, c[2] - 0.45, c[0] + 0.45, c[2] + 0.45))
 
 
 def _hang_lights(room: Room, r: Random) -> None:
@@ -162,7 +182,7 @@ def _hang_lights(room: Room, r: Random) -> None:
     rim = s.material((0.8, 0.8, 0.8))
     glow = r.uniform(4, 16) * np.array([1, r.uniform(0.9, 1), r.uniform(0.75, 1)])
     for _ in range(int(r.integers(1, 3)) if room.kind != "class" else int(r.integers(3, 7))):
-        a, b = r.uniform(0.2, 1.2), r.uniform(0.2, 0.6)
+        a, b = min(r.uniform(0.2, 1.2), wide - 0.5), r.uniform(0.2, 0.6)
         x, z = r.uniform(0.2, wide - a - 0.2), r.uniform(0.2, deep - b - 0.2)
         drop = 0.04 if r.random() < 0.7 else r.uniform(0.2, 0.7)
         s.quad((x, high - drop, z), (a, 0, 0), (0, 0, b), s.material((0.5,) * 3, emission=2 * glow), light=glow)
@@ -195,8 +215,11 @@ class _Furnisher:
         if room.kind == "class":
             self._rows_of_desks()
         kinds = ["cupboard", "cupboard", "shelf", "desk", "sofa", "bed", "radiator", "box", "curtain", "lamp"]
-        for _ in range(int(r.integers(18, 45)) if room.kind != "bare" else int(r.integers(1, 6))):
-            if r.random() < 0.5 or not self.large:
+        narrow = room.kind in ("corridor", "stairs")
+        if narrow:
+            kinds = ["shelf", "radiator", "box", "lamp"]
+        for _ in range(int(r.integers(1, 6)) if room.kind == "bare" or narrow else int(r.integers(18, 45))):
+            if narrow or r.random() < 0.5 or not self.large:
                 self._against_wall(str(r.choice(kinds)))
             else:
                 self._against_wall(self.large[r.integers(len(self.large))])

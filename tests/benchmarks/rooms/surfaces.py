@@ -12,6 +12,8 @@ from .textures import Random
 CLASSES = ("wall", "floor", "ceiling", "window", "door", "furniture", "thing", "lamp")
 Array = NDArray[np.float64]
 UP = np.array([0.0, 1.0, 0.0])
+THICK = 0.14
+"""Metres of a wall between two rooms of a home."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,8 @@ class Material:
 
 @dataclass(frozen=True)
 class Opening:
-    """A window or door in a wall: from (left, low) to (right, high), metres along and above the wall's foot."""
+    """A window, a door, a doorway with a room behind, or a passage to another room of a home, in a wall: from
+    (left, low) to (right, high), metres along and above the wall's foot."""
 
     left: float
     low: float
@@ -38,9 +41,11 @@ class Opening:
 
 
 class Surfaces:
-    """Triangles with materials and classes, and the rectangles that give light."""
+    """Triangles with materials and classes, and the rectangles that give light. What is added stands in the frame
+    `place` (4, 4)."""
 
     def __init__(self) -> None:
+        self.place = np.eye(4)
         self.parts: list[tuple[NDArray[np.float32], ...]] = []
         self.materials: list[Material] = []
         self.textures: list[NDArray[np.uint8]] = []
@@ -79,8 +84,9 @@ class Surfaces:
             normals = np.repeat(flat[:, None], 3, 1)
         numbers = np.broadcast_to(np.asarray(material, np.int32), len(triangles))
         labels = np.full(len(triangles), self.label, np.int32)
-        shape = np.asarray(normals, np.float32), np.asarray(places, np.float32)
-        self.parts.append((triangles, *shape, numbers, labels))
+        turn, start = self.place[:3, :3].T, self.place[:3, 3]
+        shape = (triangles @ turn + start).astype(np.float32), (normals @ turn).astype(np.float32)
+        self.parts.append((*shape, np.asarray(places, np.float32), numbers, labels))
 
     def quad(
         self, corner: Array, a: Array, b: Array, material: int, places: list | None = None, light: Array | None = None
@@ -93,7 +99,9 @@ class Surfaces:
         corners = [[corner, corner + a, corner + a + b], [corner, corner + a + b, corner + b]]
         self.add(np.array(corners), u[[[0, 1, 2], [0, 2, 3]]], material)
         if light is not None:
-            self.lights.append((corner, a, b, np.asarray(light, float)))
+            turn = self.place[:3, :3]
+            lamp = turn @ corner + self.place[:3, 3], turn @ a, turn @ b, np.asarray(light, float)
+            self.lights.append(lamp)
 
     def box(
         self, low: tuple, high: tuple, material: int, frame: Array | None = None, faces: tuple = tuple(range(6))
@@ -177,7 +185,7 @@ def build_wall(s: Surfaces, wall: Wall, height: float, material: int, trim: Trim
 def _close(s: Surfaces, wall: Wall, hole: Opening, material: int, trim: Trim, r: Random) -> None:
     """Reveal, frame, and window, door leaf or the room behind."""
     window = hole.kind == "window"
-    deep = r.uniform(0.06, 0.35) if window else r.uniform(0.02, 0.12)
+    deep = r.uniform(0.06, 0.35) if window else r.uniform(0.02, 0.12) if hole.kind != "passage" else THICK / 2
     corner = wall.origin + wall.along * hole.left + UP * hole.low
     width, height = hole.right - hole.left, hole.high - hole.low
     a, b, back = wall.along * width, UP * height, -wall.inward * deep
@@ -189,7 +197,7 @@ def _close(s: Surfaces, wall: Wall, hole: Opening, material: int, trim: Trim, r:
         _glaze(s, frame, corner + back, a, b, trim, r)
     elif hole.kind == "door":
         _hang_door(s, frame, corner + back, a, b, trim, r)
-    else:
+    elif hole.kind == "doorway":
         _room_behind(s, frame, width, height, trim, r)
     if r.random() < 0.8:
         t = r.uniform(0.05, 0.1)
