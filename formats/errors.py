@@ -3,6 +3,7 @@
 import importlib.metadata
 import importlib.util
 import shlex
+import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
@@ -51,9 +52,14 @@ def install_command(*requirements: str) -> str:
     A bare `pip` is that of another interpreter, or refused, where this environment is not the active one; `uv` makes
     environments without pip.
     """
-    python = shlex.quote(sys.executable)
+    python = shell_word(sys.executable)
     by = f"{python} -m pip install" if importlib.util.find_spec("pip") else f"uv pip install --python {python}"
-    return " ".join([by, *map(shlex.quote, requirements)])
+    return " ".join([by, *map(shell_word, requirements)])
+
+
+def shell_word(text: str) -> str:
+    """Return the text as one word of a command for this system's shell."""
+    return subprocess.list2cmdline([text]) if sys.platform == "win32" else shlex.quote(text)
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from io import BufferedReader
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from .errors import InputError
 
@@ -195,15 +195,20 @@ def resolve_within(root: Path, relative: str, named_by: Path) -> Path:
     reach into the rest of the disk. Links are followed, for people put data sets together from links, and what is found
     is only read; `resolve_own` is for folders that are written to.
     """
-    name = os.path.normpath(relative)  # so that no `..` is left that would be looked up behind a link
+    name = Path(os.path.normpath(relative))  # so that no `..` is left that would be looked up behind a link
     try:
         long = len(os.fsencode(root / name)) > _LONGEST_PATH
-        long = long or any(len(os.fsencode(part)) > LONGEST_NAME for part in name.split("/"))
+        long = long or any(len(os.fsencode(part)) > LONGEST_NAME for part in name.parts)
     except ValueError:
         long = True  # half a character, which no path can hold
-    if long or "\0" in relative or os.path.isabs(name) or name.split("/")[0] == "..":
+    if long or "\0" in relative or leads_out(name):
         raise InputError(f"{named_by} names the file {relative[:300]!r}, outside {root}: correct the entry")
     return root / name
+
+
+def leads_out(name: PurePath) -> bool:
+    """Return whether a normal path leads out of the folder that it is appended to: by a root, a drive or `..`."""
+    return bool(name.anchor) or name.parts[:1] == ("..",)
 
 
 def is_plain_name(name: str) -> bool:

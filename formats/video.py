@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import os
-import shlex
 import statistics
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ os.environ.setdefault("OPENCV_VIDEOIO_DEBUG", "0")
 
 import cv2
 
-from .errors import InputError, install_extra
+from .errors import InputError, install_extra, shell_word
 from .images import IMAGE_SUFFIXES
 from .reading import opened, require_unicode
 from .video_head import Display, VideoTrack, main_track, mirror_of, pixel_aspect, read_tracks
@@ -270,7 +269,7 @@ def _codec(capture: cv2.VideoCapture | AvCapture) -> str:
 
 def _undecodable(path: Path, codec: str = "", blank: int = 0) -> InputError:
     """That no image comes out; `blank`: so many, all of one flat colour, came out."""
-    convert = f"convert it with `ffmpeg -i {shlex.quote(str(path))} -c:v libx264 OUT.mp4`"
+    convert = f"convert it with `ffmpeg -i {shell_word(str(path))} -c:v libx264 OUT.mp4`"
     if codec and codec.lower() not in _DECODED:
         name = _CODECS.get(codec.lower(), codec)
         more = "" if has_pyav() else f"; `{install_extra('hdr')}` brings more decoders"

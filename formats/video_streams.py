@@ -10,7 +10,6 @@ import contextlib
 import errno
 import itertools
 import os
-import shlex
 import subprocess
 import sys
 import tempfile
@@ -25,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .atomic import atomic_path, free_bytes, is_disk_full
-from .errors import DiskFullError, InputError, install_extra
+from .errors import DiskFullError, InputError, install_extra, shell_word
 from .image_tags import tone_mapped
 from .reading import require_unicode
 from .video_head import TRANSFERS
@@ -232,7 +231,7 @@ def interlaced_error(path: Path, codec: str, first: int = 0) -> InputError:
     else:
         what = f"{path} is interlaced video (as from camcorders and television), which OpenCV does not decode"
         install = f"install PyAV with `{install_extra('hdr')}`, or "
-    fix = f"{install}convert it with `ffmpeg -i {shlex.quote(str(path))} -vf {filters} OUT.mp4`"
+    fix = f"{install}convert it with `ffmpeg -i {shell_word(str(path))} -vf {filters} OUT.mp4`"
     return InputError(f"{what}: {fix}")
 
 

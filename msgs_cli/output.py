@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import shlex
 import shutil
 import signal
 import sys
@@ -40,6 +39,7 @@ from ..pipelines.system.progress import (
     log,
     soft_stop,
 )  # fmt: skip
+from ..pipelines.system.wording import quoted
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -204,8 +204,8 @@ class TextHandler(logging.Handler):
 def program() -> str:
     """Return the word that starts this program in the user's shell: its path where it is not on the PATH."""
     own, found = Path(sys.argv[0]), shutil.which("msgs-slam")
-    is_elsewhere = own.name == "msgs-slam" and own.exists() and (found is None or not own.samefile(found))
-    return shlex.quote(str(own)) if is_elsewhere else "msgs-slam"
+    is_elsewhere = own.stem == "msgs-slam" and own.exists() and (found is None or not own.samefile(found))
+    return quoted(own) if is_elsewhere else "msgs-slam"
 
 
 def prepare_streams() -> None:

@@ -8,6 +8,7 @@ any number of batches over the same folders may be started, killed and started a
 from __future__ import annotations
 
 import traceback
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -302,8 +303,9 @@ def find_recordings(folder: Path, runs: Path) -> list[BatchItem]:
     if not sources:
         raise InputError(f"{folder} holds no video, image folder or data set")
     stems = [p.stem if p.is_file() else p.name for p in sources]
-    files = {p.name for p in sources if p.is_file()}
-    clear = [stems.count(stem) == 1 and stem not in files for stem in stems]
+    files = {p.name.casefold() for p in sources if p.is_file()}
+    alike = Counter(map(str.casefold, stems))  # one folder on disks that do not tell cases apart (NTFS, APFS)
+    clear = [alike[s] == 1 and s not in files for s in map(str.casefold, stems)]
     names = [stem if is_clear else p.name for stem, is_clear, p in zip(stems, clear, sources, strict=True)]
     return [BatchItem(n, p, runs / f"{n}.msgs") for n, p in zip(names, sources, strict=True)]
 

@@ -210,8 +210,8 @@ def run_in_processes(
 
 def _require_ended(code: int) -> None:
     if code:
-        memory = ", for want of memory perhaps" if code == -signal.SIGKILL else ""
-        how = f"ended by {signal.Signals(-code).name}{memory}" if code < 0 else f"exit code {code}"
+        name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        how = f"ended by {name}{', for want of memory perhaps' if name == 'SIGKILL' else ''}" if code < 0 else name
         raise RecoverableError(f"its process was lost: {how}")
 
 
@@ -233,7 +233,8 @@ def _run_process(work: Callable[[T, Progress], object], task: T) -> int:
 
 
 def _in_child(work: Callable[[T, Progress], object], task: T) -> None:
-    os.setsid()  # a terminal's Ctrl-C goes to all processes of a session, and the parent passes on what it means
+    if hasattr(os, "setsid"):
+        os.setsid()  # a terminal's Ctrl-C goes to all processes of a session, and the parent passes on what it means
     threading.Thread(target=_stop_with_parent, daemon=True).start()
     try:
         with soft_stop(lambda number: None):

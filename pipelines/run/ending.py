@@ -19,12 +19,13 @@ from dataclasses import asdict
 from itertools import count
 from pathlib import Path
 
-from ...formats.errors import InputError
+from ...formats.errors import InputError, RecoverableError
 from ...formats.reading import file_sha256, parsing
 from ...formats.textfile import MAX_OWN_JSON_BYTES, read_json_object, write_json
 from ..config import STAGES
 from ..system.progress import log
 from ..system.values import dataclass_from_json
+from ..system.wording import quoted
 from .folder import RunFolder
 from .manifest import content_digest
 from .reads import LOGS, Situation, StageRecord
@@ -73,8 +74,14 @@ def move_in(run: RunFolder, name: str) -> None:
     shutil.rmtree(folder / LOGS, ignore_errors=True)
     if name == STAGES[-1]:
         _spare_others(run, folder)
-    discard(target)
-    os.replace(folder, target)
+    try:
+        discard(target)
+        os.replace(folder, target)
+    except PermissionError as error:
+        raise RecoverableError(
+            f"{target} cannot be replaced ({error.strerror}): on Windows, close the programs that have a file in it "
+            f"open; elsewhere, check its rights. Then run `msgs-slam resume {quoted(run.root)}`"
+        ) from error
     _flush_folder(run.root)
 
 
@@ -100,7 +107,9 @@ def unseal(run: RunFolder, name: str) -> None:
 
 
 def _flush_folder(folder: Path) -> None:
-    """Make a rename survive a power cut."""
+    """Make a rename survive a power cut. Windows opens no folders, and NTFS keeps a journal."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     os.fsync(descriptor)
     os.close(descriptor)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import platform
 import shutil
@@ -12,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
+from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout, lock_descriptor
 
 from ...formats.errors import InputError, RecoverableError
 from .folder import RunFolder
@@ -38,18 +37,21 @@ def locked(run: RunFolder) -> Iterator[None]:
     behind. A folder that was there is never removed, nor one that another process holds. Raises RunBusyError when
     another process does, InputError when the folder cannot be written.
     """
-    made = make_folder(run.root)
+    made, spoiled = make_folder(run.root), False
     lock = _acquire(run)
     try:
         yield
     except Exception as error:
         unusable = isinstance(error, InputError) and not isinstance(error, RecoverableError)
         begun = run.manifest_file.exists()
-        if made and (not begun or (unusable and not run.records)):
+        if spoiled := made and (not begun or (unusable and not run.records)):
             shutil.rmtree(run.root, ignore_errors=True)
         raise
     finally:
         lock.release()
+        if spoiled:
+            with suppress(OSError):  # Windows removes no file that is open, as the lock's was
+                run.root.rmdir()
 
 
 def _acquire(run: RunFolder) -> BaseFileLock:
@@ -88,12 +90,9 @@ def is_locked(run: RunFolder) -> bool:
     """Whether a process works on the run now, by its lock; where there are none, by the file of its owner."""
     try:
         with _open_existing(run.path(LOCK)) as stream:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
+            return not lock_descriptor(stream.fileno(), blocking=False)
     except OSError as error:
         return error.errno in _NO_LOCKS and run.path(SOFT_LOCK).exists()
-    return False
 
 
 def _open_existing(path: Path) -> IO[bytes]:

@@ -1,13 +1,14 @@
 """Running the stages: what is up to date stays, what is not runs, what was interrupted goes on."""
 
 import gc
-import resource
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+
+import psutil
 
 from ...formats.atomic import is_disk_full, remove_temporaries
 from ...formats.errors import DiskFullError, InputError, RecoverableError
@@ -253,5 +254,9 @@ def peak_memory_mb() -> float:
     with suppress(OSError, ValueError, StopIteration):
         lines = (_PROCESS / "status").read_text(encoding="ascii").splitlines()
         return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) / 1024
+    if sys.platform == "win32":
+        return float(psutil.Process().memory_info().peak_wset) / (1024 * 1024)
+    import resource
+
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)

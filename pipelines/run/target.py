@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+import psutil
+
 from ...formats.atomic import explained, machine_token, process_token
 from ...formats.errors import InputError
 from ...formats.reading import file_sha256, is_plain_path
@@ -187,18 +189,10 @@ def _remove_left(folder: Path) -> None:
     start = f"{_STAGED}{machine_token()}-"
     for entry in _entries(folder):
         process = entry.name.removeprefix(start).partition("-")[0]
-        if entry.name.startswith(start) and entry.is_dir() and process.isdecimal() and not _is_alive(int(process)):
-            shutil.rmtree(entry, ignore_errors=True)
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):
-        return True
-    return True
+        is_own = entry.name.startswith(start) and entry.is_dir() and process.isdecimal()
+        with suppress(OverflowError):  # no process has such a number: the folder is of somebody else
+            if is_own and not psutil.pid_exists(int(process)):
+                shutil.rmtree(entry, ignore_errors=True)
 
 
 def _joined(names: list[str]) -> str:

@@ -3,7 +3,6 @@ report."""
 
 from __future__ import annotations
 
-import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,6 +16,7 @@ from ...formats.images import UNUSABLE, Header, read_deep, read_header
 from ...formats.textfile import read_text
 from ...formats.video import VideoReader
 from ...formats.video_head import main_track
+from ..system.wording import quoted
 
 _LIST_SUFFIX = ".videos"
 Warn = Callable[[str], None]
@@ -219,7 +219,7 @@ def warn_of_video(path: Path, reader: VideoReader, warn: Warn) -> None:
          f"{n} is HDR ({reader.hdr}), its colours will look flat. To read it in full: {install_extra('hdr')}"),
         (others, _about_tracks(path, reader, others) if others else ""),
         (reader.has_alpha, f"{n} has an alpha channel, which is not read: its background counts as part of the scene. "
-         f"To leave it out, make masks with `ffmpeg -i {shlex.quote(n)} -vf alphaextract -start_number 0 "
+         f"To leave it out, make masks with `ffmpeg -i {quoted(n)} -vf alphaextract -start_number 0 "
          "MASKS/%06d.png`, and pass --masks MASKS"),
         (reader.is_truncated, f"{n} is truncated: its header declares {info.frame_count_claimed} frames, {decoded} "
          "decode; going on with those"),
@@ -247,5 +247,5 @@ def _about_tracks(path: Path, reader: VideoReader, others: list[int]) -> str:
     return (
         f"{path.name} holds {len(named)} video tracks: {named[reader.track]} is used, not "
         f"{', '.join(named[i] for i in others)}. To use {named[wanted]}, copy it with "
-        f"`ffmpeg -i {shlex.quote(path.name)} -map 0:v:{wanted} -c copy OUT{path.suffix}`{more}"
+        f"`ffmpeg -i {quoted(path.name)} -map 0:v:{wanted} -c copy OUT{path.suffix}`{more}"
     )

@@ -378,10 +378,11 @@ def written_names(names: Iterable[str], root: Path) -> tuple[str, ...]:
                 f"{root}: the name {name!r} holds a line break, a control character, a slash, a drive or no UTF-8: "
                 "rename it"
             )
-        if frame in written:
-            raise InputError(f"{root}: {written[frame]!r} and {name!r} would both become {frame!r}: rename one of them")
-        written[frame] = name
-    return tuple(written)
+        # The run may be copied to a disk that does not tell cases apart (NTFS, APFS).
+        if (alike := frame.casefold()) in written:
+            raise InputError(f"{root}: {written[alike]!r} and {name!r} would both become {frame!r}: rename one of them")
+        written[alike] = name
+    return tuple(map(written_name, written.values()))
 
 
 # sizes and warnings -----------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import psutil
 
 from ...formats.errors import InputError, install_command
 from ..config import Config
@@ -38,8 +39,6 @@ MIN_SUBMAP = 60
 """Keyframes: smaller submaps are mostly border."""
 ALIGNED_TOGETHER = 200
 """Fields of depths that are solved for at once: their equations take 0.4 MB each."""
-_UNKNOWN_MACHINE = 8_000_000_000
-"""Bytes."""
 LEAST_CAPABILITY = (8, 0)
 """Compute capability of the cards that the kernels run on."""
 
@@ -84,14 +83,8 @@ def room_on(device: object, host: float) -> float:
 
 
 def machine_memory() -> float:
-    """Bytes of memory of the machine, or of the container where that has less; 8 GB where neither is known."""
-    return min([_physical_memory(), *memory_limits()])
-
-
-def _physical_memory() -> float:
-    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    return float(_UNKNOWN_MACHINE)
+    """Bytes of memory of the machine, or of the container where that has less."""
+    return min([float(psutil.virtual_memory().total), *memory_limits()])
 
 
 def available_cpus() -> int:

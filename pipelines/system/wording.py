@@ -1,16 +1,17 @@
 """Figures and numbers of frames in few words."""
 
-import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from ...formats.errors import shell_word
 
 MAX_STRETCHES = 8
 
 
 def quoted(path: Path | str) -> str:
     """A path as a word of a command that can be pasted into a shell."""
-    return shlex.quote(str(path))
+    return shell_word(str(path))
 
 
 def stretches(ids: Iterable[int], limit: int = MAX_STRETCHES) -> str:

@@ -162,11 +162,12 @@ def test_shards_are_disjoint_and_together_all(recordings: Path, tmp_path: Path) 
 
 
 def test_recordings_of_one_name_have_runs_of_their_own(tmp_path: Path) -> None:
-    for name in ("a.mp4", "a.mov", "a.mov.mp4", "b.mp4", ".hidden.mp4x"):
+    for name in ("a.mp4", "a.mov", "a.mov.mp4", "b.mp4", "c.mp4", "C.mov", ".hidden.mp4x"):
         (tmp_path / name).write_bytes(b"x")
     found = find_recordings(tmp_path, tmp_path / "runs")
     assert [(r.name, r.run.name) for r in found] == [
-        ("a.mov", "a.mov.msgs"), ("a.mov.mp4", "a.mov.mp4.msgs"), ("a.mp4", "a.mp4.msgs"), ("b", "b.msgs"),
+        ("C.mov", "C.mov.msgs"), ("a.mov", "a.mov.msgs"), ("a.mov.mp4", "a.mov.mp4.msgs"), ("a.mp4", "a.mp4.msgs"),
+        ("b", "b.msgs"), ("c.mp4", "c.mp4.msgs"),
     ]  # fmt: skip
     with pytest.raises(InputError, match="is not a folder"):
         find_recordings(tmp_path / "a.mp4", tmp_path)

@@ -234,6 +234,7 @@ def test_what_may_not_be_read_is_said(name: str, tmp_path: Path) -> None:
         (("\x1b[31m.jpg",), "control character"),
         (("\udcff\udcfe.jpg",), "no UTF-8"),
         (("a.bmp", "a.bmp.png"), "would both become"),
+        (("b.png", "B.png"), "would both become"),
         (("x" * 251 + ".bmp",), "longer than 255 bytes"),
     ],
 )

@@ -1,0 +1,17 @@
+"""The packages: msgs_slam/ and the folders that it links to are one, whatever else lies beside. pyproject.toml, which
+says all else, cannot say where they lie in a checkout without links, as Git for Windows makes it.
+"""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+ROOMS = ("formats", "msgs_cli", "pipelines")
+has_links = all(Path("msgs_slam", room).is_dir() for room in ROOMS)
+inner = find_packages(".", include=[f"{room}{below}" for room in ROOMS for below in ("", ".*")])
+
+setup(
+    packages=["msgs_slam", *(f"msgs_slam.{name}" for name in inner)],
+    # A path alone where it can be: of it an editable install is made that editors read too.
+    package_dir={"": "."} | ({} if has_links else {f"msgs_slam.{room}": room for room in ROOMS}),
+)
