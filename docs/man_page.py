@@ -23,10 +23,7 @@ def man_page() -> str:
         ".SH EXIT STATUS",
         "0 if all went well, 1 for an input that cannot be used, 2 for a wrong option or setting,",
     ]
-    return (
-        "\n".join([*lines, "130 after Ctrl\\-C. A run that was stopped goes on by", '.BR "msgs\\-slam resume" .'])
-        + "\n"
-    )
+    return "\n".join([*lines, "130 after Ctrl\\-C. To resume an interrupted run:", '.BR "msgs\\-slam resume" .']) + "\n"
 
 
 def commands(group: click.Group, name: str) -> Iterator[str]:

@@ -123,6 +123,14 @@ class MeshArrays:
         if not (np.abs(self.vertices) < FARTHEST).all():
             raise ValueError("MeshArrays: a vertex is not finite, or too far away")
 
+    def of_labels(self, labels: Iterable[int]) -> "MeshArrays":
+        """Return the faces whose three vertices have one of these labels, and the vertices that they need."""
+        wanted = np.isin(self.labels, list(labels))
+        faces = self.faces[wanted[self.faces].all(1)]
+        used, corners = np.unique(faces, return_inverse=True)
+        faces = corners.reshape(-1, 3).astype(np.int32)
+        return MeshArrays(self.vertices[used], faces, self.colors[used], self.labels[used])
+
 
 @dataclass(frozen=True)
 class MeshBlocks:

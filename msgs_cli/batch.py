@@ -46,10 +46,10 @@ def batch(
     folder: Path, out: Path, engine_name: str, address: str, shard: slice, config_file: Path | None,
     overrides: tuple[str, ...], until: str, output: Output, **given: str | int | None,
 ) -> None:  # fmt: skip
-    """Reconstruct every video, image folder and data set in FOLDER, a run each, and go on after failures.
+    """Reconstruct every video, image folder and data set in FOLDER, each into its own run; failures stop nothing.
 
-    Prints one table; the exit code is 1 where a recording failed, and RUNS/NAME.failed.txt says why. The same command
-    goes on where it was stopped. With --shard many machines share the work over one disk (SLURM arrays, Kubernetes
+    Prints one table; the exit code is 1 if a recording failed, and RUNS/NAME.failed.txt says why. If interrupted, run
+    the same command to continue. With --shard many machines share the work over one disk (SLURM arrays, Kubernetes
     indexed jobs, AWS Batch: docs/batch.md).
 
     \b
@@ -62,7 +62,7 @@ def batch(
     with open_cluster(engine_name, address, read(), output) as cluster:
         out.mkdir(parents=True, exist_ok=True)
         try:
-            with output.stopping_softly("The same command goes on with it."):
+            with output.stopping_softly("Run the same command to continue."):
                 failed = run_batch(recordings[shard], read, until, output.task_progress, cluster)
         finally:
             write_table(out, rows := [table_row(r) for r in recordings])

@@ -41,7 +41,10 @@ class Finding:
 def doctor() -> None:
     """Check this machine and suggest fixes.
 
-    Exit code 1 where something would keep a reconstruction from running.
+    Exit code 1 if something would keep a reconstruction from running.
+
+    \b
+    Example: msgs-slam doctor
     """
     findings = examine(Path("."))
     print_findings(findings)
@@ -187,9 +190,9 @@ def _kernels() -> Finding:
         folder = cache_root()
     if folder is None:
         fix = "set NUMBA_CACHE_DIR to a folder of yours that can be written"
-        return Finding(NOTE, "cannot be kept: every start compiles for about a minute", fix)
+        return Finding(NOTE, "cannot be cached: every start compiles for about a minute", fix)
     kept = sum(1 for _ in folder.rglob("*.nbi"))
-    return Finding(GOOD, f"{kept} kept in {folder}" if kept else f"will be kept in {folder}")
+    return Finding(GOOD, f"{kept} cached in {folder}" if kept else f"will be cached in {folder}")
 
 
 def _disk(folder: Path) -> Finding:

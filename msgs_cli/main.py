@@ -127,7 +127,7 @@ def main() -> None:
     """Turn an ordinary video into camera poses, a semantic 3D Gaussian map and a labelled mesh.
 
     \b
-    msgs-slam demo                      try it on a small synthetic room (about 4 minutes on two cores)
+    msgs-slam demo                      try it on a small synthetic room (about 3 CPU minutes)
     msgs-slam reconstruct video.mp4     the whole job; writes video.msgs/
     msgs-slam resume video.msgs         resume an interrupted run
     msgs-slam extend RUN more.mp4       extend a finished run with another video
@@ -187,7 +187,7 @@ def reconstruct_command(
 @RUN_ARGUMENT
 @click.option(
     "--redo", type=click.Choice(STAGES),
-    help="Make this stage and those after it again, with the networks that are installed now; run.toml stays.",
+    help="Run this stage and all later ones again, with the networks that are installed now; run.toml stays as it is.",
 )  # fmt: skip
 @settings_options
 @quality_option
@@ -225,11 +225,11 @@ def resume_command(
 @click.argument("videos", metavar="VIDEO...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @verbosity_options
 def extend_command(run_path: Path, videos: tuple[Path, ...], output: Output) -> None:
-    """Add VIDEO, by the same camera and of the same place, to the finished RUN.
+    """Add VIDEO, filmed with the same camera in the same place, to the finished RUN.
 
-    The run is made anew from all its videos, with its poses given, as by --poses: all are adjusted together, and the
-    result is moved onto them, so that coordinates stay what they were, as near as the adjustment allows. Stopped, the
-    same command or `msgs-slam resume RUN` goes on.
+    The run is computed again from all its videos, starting from the known poses as with --poses. All poses are adjusted
+    together, and the result is aligned to the old ones, so that coordinates stay the same as closely as the adjustment
+    allows. If interrupted, run the same command or `msgs-slam resume RUN` to continue.
 
     \b
     Example: msgs-slam extend video.msgs kitchen.mp4
@@ -243,14 +243,14 @@ def extend_command(run_path: Path, videos: tuple[Path, ...], output: Output) -> 
     results.report_run(output, run.root, records)
 
 
-_EXPORT_HELP = f"""Export a finished RUN to files for other programs. What the run writes by itself is in RUN/export and
-stays as it is.
+_EXPORT_HELP = f"""Export a finished RUN to files for other programs. The files that every run writes are in RUN/export
+and stay as they are.
 
 \b
 Kinds for --only, and settings (--set export.NAME=VALUE) of each:
 {kinds_help()}
 
-Settings hold for the files that are written; `msgs-slam resume RUN --set ...` changes them in the run itself.
+The settings apply to the files written now; `msgs-slam resume RUN --set ...` changes them in the run itself.
 
 \b
 Example: msgs-slam export video.msgs --only ply --to shared
@@ -261,7 +261,7 @@ Example: msgs-slam export video.msgs --only ply --to shared
 @RUN_ARGUMENT
 @click.option(
     "--only", type=KindOfFile([row.kind for row in EXPORTS]), metavar="KIND",
-    help="Write one kind of file only. Default: all that the run itself writes.",
+    help="Write one kind of file only. Default: all kinds that every run writes.",
 )  # fmt: skip
 @click.option("--to", type=FOLDER, metavar="DIR", help="Where to write. Default: RUN/exports/KIND, or all.")
 @OVERWRITE
@@ -305,7 +305,11 @@ def export(
 def demo(
     out: Path, config_file: Path | None, overrides: tuple[str, ...], output: Output, **given: str | int | None
 ) -> None:
-    """Reconstruct a synthetic test clip and print its errors against ground truth."""
+    """Reconstruct a synthetic test clip and print its errors against ground truth.
+
+    \b
+    Example: msgs-slam demo --out /tmp/demo
+    """
     config = chosen_config(config_file, overrides, given)
     from ..pipelines.evaluation.write import demo_summary, run_demo
     from ..pipelines.reconstruct import reconstruct
@@ -331,7 +335,11 @@ def demo(
 @main.command()
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 def completion(shell: str) -> None:
-    """Print a shell completion script: msgs-slam completion bash >> ~/.bashrc."""
+    """Print a shell completion script.
+
+    \b
+    Example: msgs-slam completion bash >> ~/.bashrc
+    """
     from click.shell_completion import get_completion_class
 
     found = get_completion_class(shell)
@@ -342,7 +350,11 @@ def completion(shell: str) -> None:
 @main.command("config")
 @settings_options
 def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
-    """Print every setting as commented TOML: save it, change it, pass it with --config."""
+    """Print every setting as commented TOML: save it, change it, pass it with --config.
+
+    \b
+    Example: msgs-slam config --set frames.rate=5 > my.toml
+    """
     from ..pipelines.run.settings import config_to_toml, load_config
 
     click.echo(config_to_toml(load_config(config_file, overrides)), nl=False)

@@ -28,7 +28,11 @@ def _size(model: Model) -> str:
 
 @models.command("list")
 def list_models() -> None:
-    """List the known models: whether each is here, its size and its licence."""
+    """List the known models: which are installed, their sizes and licences.
+
+    \b
+    Example: msgs-slam models list
+    """
     from ..pipelines.networks.registry import ModelStore
 
     store, rows = ModelStore.open(), []
@@ -52,7 +56,9 @@ def list_models() -> None:
 
 @models.command()
 @click.argument("names", nargs=-1)
-@click.option("--best", is_flag=True, help="The small ones and the large network for metric depth (80 MB in all).")
+@click.option(
+    "--best", is_flag=True, help="The small ones and a large one for metric depth, free for all uses (145 MB)."
+)
 @click.option(
     "--from", "folder", type=click.Path(path_type=Path),
     help="Take the files from this folder, under any file names, instead of the network.",
@@ -61,12 +67,15 @@ def list_models() -> None:
     "--trust", is_flag=True,
     help="Accept a model without a published sha256 (DINOv2's head), and remember the hash of the downloaded file.",
 )  # fmt: skip
-@click.option("--offline", is_flag=True, help="Only check what is here; download nothing.")
+@click.option("--offline", is_flag=True, help="Only check what is installed; download nothing.")
 @click.option("--yes", is_flag=True, help="Do not ask about the licences.")
 def pull(names: tuple[str, ...], best: bool, folder: Path | None, trust: bool, offline: bool, yes: bool) -> None:
     """Download models by name, with what they need; without a name the small ones (4 MB): classes, metres, people.
 
-    A file takes its place when it is whole, by its sha256.
+    A file is installed only if its SHA-256 is right.
+
+    \b
+    Example: msgs-slam models pull --yes
     """
     from ..formats.errors import InputError
     from ..pipelines.networks.registry import ModelStore
@@ -115,10 +124,18 @@ def _pull_one(store: ModelStore, model: Model, trust: bool, offline: bool) -> Pa
 
 @models.command()
 @click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
-@click.option("--family", required=True, help="Which contract it keeps, for example metric3d-community or moge.")
+@click.option(
+    "--family",
+    required=True,
+    help="Its family, as for example metric3d-community or moge.",
+)
 @click.option("--name", default="", help="Its name in the cache; by default the file's own.")
 def add(file: Path, family: str, name: str) -> None:
-    """Copy your own ONNX or TFLite file into the cache as a model of a known family."""
+    """Install your own ONNX or TFLite file as a model of a known family.
+
+    \b
+    Example: msgs-slam models add depth.onnx --family moge
+    """
     from ..pipelines.networks.registry import ModelStore
 
     model = ModelStore.open().add(file, family, name)
@@ -127,7 +144,11 @@ def add(file: Path, family: str, name: str) -> None:
 
 @models.command()
 def verify() -> None:
-    """Compare every file in the cache with its hash; exit code 1 when one is damaged."""
+    """Check every installed file against its hash; exit code 1 if one is damaged.
+
+    \b
+    Example: msgs-slam models verify
+    """
     from ..pipelines.networks.registry import ModelStore
 
     found = ModelStore.open().verify()
@@ -140,7 +161,11 @@ def verify() -> None:
 @models.command()
 @click.argument("name")
 def path(name: str) -> None:
-    """Print the path of a model's file."""
+    """Print the path of a model's file.
+
+    \b
+    Example: msgs-slam models path fast-depth
+    """
     from ..formats.errors import InputError
     from ..pipelines.networks.registry import ModelStore
 

@@ -35,8 +35,8 @@ UNTIL = click.option("--until", type=click.Choice(STAGES), default=STAGES[-1], h
 
 OVERWRITE = click.option(
     "--overwrite", is_flag=True,
-    help="Replace files in the way that msgs-slam has not written, or that were changed since. Without it the command "
-    "is refused.",
+    help="Replace existing files even if msgs-slam has not written them, or they were changed since. Without it the "
+    "command refuses to.",
 )  # fmt: skip
 
 

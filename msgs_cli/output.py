@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 _BAR = "{desc} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
-_WIDTH = 32
+_WIDTH = 44
 """Of what is before the bar."""
 _STOPPING = (
     "Stopping at the next snapshot. Press Ctrl-C again to stop now (what was done since the last snapshot is lost)."

@@ -33,9 +33,13 @@ KEY_FIGURES = {
 @click.command()
 @RUN_ARGUMENT
 @click.option("-v", "--verbose", is_flag=True, help="Every figure of every stage.")
-@click.option("--json", "as_json", is_flag=True, help="The same for programs, with every figure.")
+@click.option("--json", "as_json", is_flag=True, help="The same as JSON, with every figure.")
 def status(run_path: Path, verbose: bool, as_json: bool) -> None:
-    """Say which stages of RUN are done, what they found, what was degraded, and which files are damaged."""
+    """Show which stages of RUN are done, what they found, what was degraded, and which files are damaged.
+
+    \b
+    Example: msgs-slam status video.msgs
+    """
     from ..pipelines.reconstruct import all_stages
     from ..pipelines.run.status import run_status
 
@@ -94,7 +98,10 @@ def evaluate(run_path: Path, truth: Path, truth_format: str, class_map: str | No
 @click.command()
 @RUN_ARGUMENT
 @click.option(
-    "--to", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Default: report.html in the run."
+    "--to",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Where to write it. Default: report.html in the run.",
 )
 @OVERWRITE
 @verbosity_options
@@ -139,8 +146,8 @@ class Size(click.ParamType):
 )  # fmt: skip
 @click.option(
     "--path", "camera_path", default="smooth", show_default=True, metavar="own|smooth|orbit|FILE",
-    help="The run's own camera path, the same smoothed, an arc about the scene from where it was filmed, or a path "
-    "saved in `view`.",
+    help="The run's own camera path, the same path smoothed, an arc around the scene on the filmed side, or a "
+    "path saved in `view`.",
 )  # fmt: skip
 @click.option(
     "--fps", type=click.FloatRange(0.1, 240), help="Images per second. Default: 30, or as the path's FILE says."
@@ -174,11 +181,11 @@ def render(
 
 @click.command()
 @RUN_ARGUMENT
-@click.option("--port", default=0, type=click.IntRange(0, 65535), help="Where to serve. Default: any free one.")
+@click.option("--port", default=0, type=click.IntRange(0, 65535), help="Port to serve on. Default: any free one.")
 def view(run_path: Path, port: int) -> None:
-    """View RUN in the browser: serve its map's page on this machine, to this machine alone.
+    """View RUN in the browser: serve the page of its map to this machine only.
 
-    A run that is not finished shows what its stages have made by now, and more as soon as another one ends.
+    An unfinished run shows the results of its finished stages, and updates as soon as another one ends.
 
     \b
     Example: msgs-slam view video.msgs

@@ -58,7 +58,7 @@ class RunConfig:
 
     quality: str = setting(
         "normal", "draft: a third of the time or less, fewer keyframes and smaller images; best: larger images, more "
-        "passes, the largest networks that are installed. Other options and settings win",
+        "passes, the largest networks that are installed. Explicit options and settings take precedence",
         ("draft", "normal", "best"), option=Option("quality"),
     )  # fmt: skip
     seed: int = setting(0, "seed of every random choice", within=(0, 2**31 - 1))

@@ -119,6 +119,12 @@ class Intrinsics:
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
+    def of_size(self, width: int, height: int) -> Intrinsics:
+        """The camera of images of another size that sees as much from top to bottom, and more or less at the sides."""
+        scale = height / self.height
+        cx = self.cx * scale + (width - self.width * scale) / 2
+        return Intrinsics(width, height, self.fx * scale, self.fy * scale, cx, self.cy * scale)
+
     def every(self, stride: int) -> Intrinsics:
         """The camera of an image's pixels [stride // 2 :: stride] along both sides.
 
@@ -336,4 +342,4 @@ class Metres:
         about, guess = ("about ", "estimated ") if self.is_guess else ("", "")
         percent = 100 * self.relative_sd
         spread = f"{percent:.0f}" if percent >= 2 else f"{percent:.1f}"
-        return f"1 unit = {about}{self.per_unit:.{2 if self.is_guess else 3}g} m ± {spread} % ({guess}from {text})"
+        return f"1 unit = {about}{self.per_unit:.{2 if self.is_guess else 3}g} m ± {spread}% ({guess}from {text})"

@@ -37,6 +37,10 @@ BANNED = {
     r"of what is mapped": "map extent",
     r"[Tt]ype:? `?msgs-slam": "run `msgs-slam`",
     r"\bunsure\b": "uncertain",
+    r"[\d…] %(?![(\w])": "28%",
+    r"\bgoes on (where|with)|\bgo on where": "continues, resumes",
+    r"to look at and to send": "easy to share",
+    r"hardly an? (frame|image)": "almost no",
 }
 """Regular expression → what to write instead."""
 
@@ -77,6 +81,13 @@ def texts_of_help(command: click.Command, name: str) -> Iterator[tuple[str, str]
             yield f"{name} {parameter.opts[0]}", f"{parameter.metavar or ''} {parameter.help or ''}"
     for below in command.commands.values() if isinstance(command, click.Group) else ():
         yield from texts_of_help(below, f"{name} {below.name}")
+
+
+def test_every_command_shows_an_example() -> None:
+    commands = [(name, text) for name, text in texts_of_help(main, "msgs-slam") if " -" not in name]
+    groups = {"msgs-slam", "msgs-slam models"}
+    assert len(commands) > 15
+    assert [name for name, text in commands if name not in groups and f"Example: {name}" not in text] == []
 
 
 def texts_of_pages() -> Iterator[tuple[str, str]]:

@@ -209,7 +209,7 @@ def _shared_intrinsics(
         if np.abs(stated - mean).max() > allowed:
             return refused
         values[key] = mean
-    return values, ("the intrinsics of the images differ by less than 1 %: their mean is used",)
+    return values, ("the intrinsics of the images differ by less than 1%: their mean is used",)
 
 
 def write_transforms(

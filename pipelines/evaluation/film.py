@@ -79,7 +79,8 @@ def render_run(
     flight = None if given is None else given.in_world_of_run(run)
     outcome = load_outcome(run)
     outcome.require_map()
-    outcome = outcome if size is None else _of_size(outcome, size)
+    if size is not None:
+        outcome = _seen_by(outcome, outcome.calibration.intrinsics.of_size(*size))
     near, far = common_depth_range(outcome)
     if flight is None:
         views = [(outcome, pose) for pose in _path(outcome, str(path), rate, (near * far) ** 0.5)]
@@ -124,15 +125,6 @@ def _write(place: Target, target: Path, pictures: Iterator[Picture], fps: float)
                 target, codec, install_extra("hdr"),
             )  # fmt: skip
     return target
-
-
-def _of_size(outcome: Outcome, size: tuple[int, int]) -> Outcome:
-    """The same seen by a camera with so many pixels; of another shape it sees more or less at the sides."""
-    k = outcome.calibration.intrinsics
-    width, height = size
-    scale = height / k.height
-    cx = k.cx * scale + (width - k.width * scale) / 2
-    return _seen_by(outcome, Intrinsics(width, height, k.fx * scale, k.fy * scale, cx, k.cy * scale))
 
 
 def _with_fov(outcome: Outcome, fov: float) -> Outcome:

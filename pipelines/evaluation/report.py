@@ -102,7 +102,7 @@ def _heading(outcome: Outcome, target: Path) -> str:
     after = _AFTER.get(outcome.map_stage or outcome.pose_stage, "")
     head, run = f'<h1>{escape(outcome.run.place.name)}</h1><p class="sub">Source: {source}{after}</p>', outcome.run
     in_run = target.resolve().parent == run.root.resolve() and run.has("export", WEB_PAGE)
-    link = f'<p><a href="export/{WEB_PAGE}">The map in one page</a>, to look at and to send.</p>' if in_run else ""
+    link = f'<p><a href="export/{WEB_PAGE}">Open the map</a> (one file, easy to share).</p>' if in_run else ""
     return head + chips(pairs) + link
 
 
@@ -292,7 +292,7 @@ def _depth_scale(nearest: float, farthest: float, unit: str) -> str:
     colors = ",".join("rgb({},{},{})".format(*c) for c in depth_picture(depths[None], nearest, farthest)[0].tolist())
     low, middle, high = (f"{depths[k]:.2g}" for k in (0, 4, 8))
     bar = f'<i style="background:linear-gradient(to right,{colors})"></i>'
-    middle = f"<span>({middle} in the middle)</span>"
+    middle = f"<span>(median {middle})</span>"
     return f'<div class="legend scale">depth, {escape(unit)}: {low} {bar} {high} {middle}</div>'
 
 

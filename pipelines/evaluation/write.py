@@ -44,7 +44,7 @@ JUDGED = "judged"
 """Key of evaluation.json: the `identity_of` the outcome."""
 PATH_FROM_ABOVE, PATH_FROM_THE_SIDE = "trajectory_top.svg", "trajectory_side.svg"
 SHEET_VIEWS = 6
-TITLES = ("frame", "map", "depth of the map", "true depth", "error, white = 10 %", "labels of the map", "true labels")
+TITLES = ("frame", "map", "depth of the map", "true depth", "error, white = 10%", "labels of the map", "true labels")
 
 
 def write_evaluation(

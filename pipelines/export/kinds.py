@@ -63,7 +63,7 @@ EXPORTS = (
         (
             ExportedFile(
                 WEB_PAGE,
-                "the map to look at and to send: one page, 20 MB at most, that needs neither a server nor a network; "
+                "the map in one page, easy to share: 20 MB at most, no server or network needed; "
                 "colours and classes, orbit and walk, the camera's path, a measuring tape",
                 "any browser with WebGL 2, on a computer or a phone",
             ),
@@ -101,7 +101,7 @@ EXPORTS = (
         (
             ExportedFile(
                 "trajectory.txt",
-                "a pose for every image of the source, those between the frames of images/ too unless --pose-frames "
+                "a pose for every source image, including those not in images/ unless --pose-frames "
                 "leaves them out; TUM format: timestamp tx ty tz qx qy qz qw (camera in the world)",
                 "evo",
             ),

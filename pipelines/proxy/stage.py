@@ -140,7 +140,7 @@ class ProxyStage:
         if self.work.depths.name == MultiviewDepth.name and reliable < _MOSTLY_MATCHED:
             self.warn(
                 f"only {reliable:.0%} of the pixels could be matched between views; elsewhere (bare walls, plain "
-                "floors) depth is filled in from around them, and surfaces there may be 10 % or more too close. Film "
+                "floors) depth is filled in from around them, and surfaces there may be 10% or more too close. Film "
                 "closer and with more texture in view, or let a depth network help: `msgs-slam models pull --best`"
             )
 

@@ -38,8 +38,8 @@ class RunProgress:
 
     @property
     def text(self) -> str:
-        """running, features 57 %, about 4 min left"""
-        share = f", {self.label} {100 * self.done // self.of} %" if self.of else ""
+        """running, features 57%, about 4 min left"""
+        share = f", {self.label} {100 * self.done // self.of}%" if self.of else ""
         return f"running{share}" + (f", {about(self.left)} left" if self.left else "")
 
 

@@ -15,6 +15,11 @@ from typing import Any, Protocol, TypeVar
 T = TypeVar("T")
 _SECONDS_BETWEEN_LINES = 600.0
 log = logging.getLogger("msgs_slam")
+IN_WORDS = {
+    "frames": "camera poses", "proxy": "depth and classes", "tracking": "remaining poses", "mapping": "map",
+    "global_ba": "closing loops", "export": "files",
+}  # fmt: skip
+"""What the stages bring, for people."""
 BEGUN, ENDED, UP_TO_DATE, STOPPED, REFUSED = "begun", "done", "up to date", "stopped", "failed"
 
 
@@ -38,8 +43,8 @@ class StageEvent:
 
     @property
     def title(self) -> str:
-        """Heading such as "[2/6 proxy]"."""
-        return f"[{self.index}/{self.of} {self.name}]"
+        """Heading such as "[2/6 depth and classes]"."""
+        return f"[{self.index}/{self.of} {IN_WORDS.get(self.name, self.name)}]"
 
     @property
     def left_text(self) -> str:

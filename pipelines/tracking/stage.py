@@ -176,7 +176,7 @@ class TrackingStage:
 
 
 def warn_of_stretches(context: StageContext, frames: list[Frame], unplaced: Collection[int]) -> None:
-    """Warn of each stretch of a film, a second or longer, in which hardly a frame has a position."""
+    """Warn of each stretch of a film, a second or longer, in which almost no frame has a position."""
     times = {f.id: f.timestamp for f in frames}
     if len(frames) < 2 or float(np.median(np.diff(sorted(times.values())))) >= _LONG:  # photographs
         return

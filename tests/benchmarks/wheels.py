@@ -1,5 +1,6 @@
-"""Whether every dependency has a wheel for Windows and for Macs, for each version of Python: asks the package index, installs nothing."""
+"""Whether every dependency has a wheel for Windows and for Macs: asks the package index, installs nothing."""
 
+import argparse
 import subprocess
 import sys
 import tomllib
@@ -19,6 +20,7 @@ def is_there(requirement: str, system: str, version: str) -> bool:
 
 def main() -> None:
     """Print a row for each system and version, with what lacks a wheel there."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
     extras = [r for name in ("words", "hdr", "usd", "lpips") for r in project["optional-dependencies"][name]]
     for system in SYSTEMS:

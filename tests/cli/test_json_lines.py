@@ -13,6 +13,7 @@ import pytest
 from cli_runs import QUICK, FinishedRun
 
 from msgs_slam.msgs_cli.output import json_outcome
+from msgs_slam.pipelines.system.progress import IN_WORDS
 
 COMMAND = [sys.executable, "-m", "msgs_slam"]
 JSON = ("--log-format", "json")
@@ -127,9 +128,7 @@ def test_without_it_a_file_gets_a_line_a_stage(copied_run: Callable[[str], Path]
     done = run("resume", folder, "--set", "export.voxel=0.06")
     assert done.returncode == 0
     lines = [line for line in done.stderr.splitlines() if line.startswith("[")]
-    assert [line.split("]")[0] for line in lines] == [
-        f"[{i}/6 {name}" for i, name in enumerate(("frames", "proxy", "tracking", "mapping", "global_ba", "export"), 1)
-    ]
-    assert lines[-1].startswith("[6/6 export] done in ")
+    assert [line.split("]")[0] for line in lines] == [f"[{i}/6 {name}" for i, name in enumerate(IN_WORDS.values(), 1)]
+    assert lines[-1].startswith("[6/6 files] done in ")
     assert "\r" not in done.stderr
     assert "%|" not in done.stderr

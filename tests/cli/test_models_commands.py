@@ -58,7 +58,7 @@ def test_pull_without_a_network_says_what_to_do_and_asks_for_the_licence_first(c
     offline = models("pull", "--offline")
     assert offline.exit_code == 1
     assert "ade20k-small is not in" in offline.stderr
-    assert "metric3d-small is not in" in models("pull", "--best", "--offline").stderr
+    assert "moge2-small is not in" in models("pull", "--best", "--offline").stderr
     assert "--trust" not in models("pull", "--best", "--yes", "--offline").stderr
     refused = CliRunner().invoke(main, ["models", "pull", "moge2-small"], input="n\n")
     assert refused.exit_code == 1
@@ -87,7 +87,7 @@ def test_what_the_program_recommends_can_be_pulled(
     done = models("pull", "--yes", *words)
     assert done.exit_code == 0, done.output
     assert {"ade20k-small", "fast-depth", "person"} <= set(fetched)
-    assert ("metric3d-small" in fetched) == bool(words)
+    assert ("moge2-small" in fetched) == bool(words)
 
 
 def test_files_of_a_folder_are_taken_by_their_content(cache: Path, tmp_path: Path, shared_data: Path) -> None:

@@ -125,8 +125,7 @@ def test_an_installation_brings_one_name_only(tmp_path: Path) -> None:
         pytest.skip("setuptools is not installed")
     command = [
         sys.executable,
-        "-c",
-        "import setuptools; setuptools.setup()",
+        "setup.py",
         "-q",
         "egg_info",
         "--egg-base",

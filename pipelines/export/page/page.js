@@ -120,7 +120,7 @@ function addLegend() {
     Object.assign(box, { type: "checkbox", checked: true });
     box.onchange = () => { cloud.shown[k] = box.checked ? 1 : 0; again(); };
     swatch.style.background = `rgb(${entry.color})`;
-    share.textContent = entry.share < 0.005 ? "< 1 %" : `${Math.round(100 * entry.share)} %`;
+    share.textContent = entry.share < 0.005 ? "< 1%" : `${Math.round(100 * entry.share)}%`;
     row.append(box, swatch, entry.name, share);
     find("legend").append(row);
   });

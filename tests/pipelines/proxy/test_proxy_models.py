@@ -182,7 +182,7 @@ def test_the_table_is_complete_and_every_family_makes_a_card(tmp_path: Path) -> 
 
 def test_one_word_pulls_what_a_room_needs(tmp_path: Path) -> None:
     models = ModelStore.open(tmp_path)
-    best = ["metric3d-small", "ade20k-small", "fast-depth", "person"]
+    best = ["moge2-small", "ade20k-small", "fast-depth", "person"]
     assert [m.name for m in models.with_needed((), best=True)] == best
     small = models.with_needed(())
     assert [m.name for m in small] == ["ade20k-small", "fast-depth", "person"]
@@ -190,6 +190,7 @@ def test_one_word_pulls_what_a_room_needs(tmp_path: Path) -> None:
     for model in models.with_needed([m.name for m in models.models if m.pull]):
         assert model.bytes > 0
         assert len(model.sha256) == 64
+        assert model.commercial, "free for all uses"
     assert [m.name for m in models.with_needed(("dinov2-small", "dinov2-small-head"))] == [
         "dinov2-small",
         "dinov2-small-head",

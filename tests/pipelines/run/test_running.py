@@ -60,7 +60,7 @@ def test_the_stage_that_a_process_is_at_runs(seen: States, source: Path, tmp_pat
     reconstruct.reconstruct(source, run, Config(), SilentProgress())
     at_half, renamed = seen
     assert at_half[:2] == renamed[:2] == ("done", "done")
-    assert at_half[2].startswith("running, poses 50 %")
+    assert at_half[2].startswith("running, poses 50%")
     assert renamed[2].startswith("running")
     assert set(at_half[3:]) == set(renamed[3:]) == {"not yet"}
     assert {s.state for s in run_status(run).stages} == {"done"}
@@ -75,7 +75,7 @@ def test_what_a_killed_process_has_noted_does_not_run(seen: States, source: Path
     assert [s.state_text for s in run_status(run).stages[:2]] == ["done", "interrupted"]
     with locked(run):
         assert load_run_progress(run) == RunProgress("proxy", "depth", 3, 4, 240.0)
-        assert run_status(run).stages[1].state_text == "running, depth 75 %, about 4 min left"
+        assert run_status(run).stages[1].state_text == "running, depth 75%, about 4 min left"
         (run.root / PROGRESS).write_text("{")
         assert run_status(run).stages[1].state == "interrupted"
     assert not is_locked(run)

@@ -67,12 +67,13 @@ def test_bars_name_their_stage_and_close_at_their_count(monkeypatch: pytest.Monk
     bars.stage(event(UP_TO_DATE))
     said = sys.stderr.getvalue()  # type: ignore[attr-defined]
     last = [piece for piece in said.replace("\n", "\r").split("\r") if "|" in piece]
-    assert any(piece.startswith("[2/6 proxy] depth") and "100%" in piece and "2/2" in piece for piece in last)
+    title = "[2/6 depth and classes]"
+    assert any(piece.startswith(f"{title} depth") and "100%" in piece and "2/2" in piece for piece in last)
     assert "about 4 min to the end" in said
-    assert "[2/6 proxy] camera model" in said
+    assert "[2/6 depth and classes] camera model" in said
     assert "100%" in last[-1]
-    assert "[2/6 proxy] done in 96 s; about 4 min left" in said
-    assert "[2/6 proxy] up to date" in said
+    assert "[2/6 depth and classes] done in 96 s; about 4 min left" in said
+    assert "[2/6 depth and classes] up to date" in said
 
 
 def test_lines_are_a_stage_each(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,11 +83,11 @@ def test_lines_are_a_stage_each(capsys: pytest.CaptureFixture[str], monkeypatch:
     lines.stage(event(BEGUN))
     assert list(lines.track(range(3), "depth", 3)) == [0, 1, 2]
     lines.stage(event(ENDED))
-    assert capsys.readouterr().err == "room: [2/6 proxy] done in 96 s; about 4 min left\n"
+    assert capsys.readouterr().err == "room: [2/6 depth and classes] done in 96 s; about 4 min left\n"
     lines.stage(event(BEGUN))
     for _ in lines.track(range(3), "depth", 3):
         now[0] += 400
-    assert capsys.readouterr().err == "room: [2/6 proxy] depth 2 of 3\n", "a sign of life of what takes long"
+    assert capsys.readouterr().err == "room: [2/6 depth and classes] depth 2 of 3\n", "a sign of life"
 
 
 def test_a_run_within_a_stage_is_work_of_that_stage() -> None:
