@@ -17,6 +17,8 @@ import pytest
 from numpy.typing import NDArray
 
 BROWSER = next((b for n in ("chromium", "chromium-browser", "google-chrome") if (b := shutil.which(n))), None)
+HANGS = 900.0
+"""Seconds after which a page is taken to hang. No test depends on how fast it answers."""
 FLAGS = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
@@ -39,7 +41,7 @@ class Page:
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
-            answer = json.loads(self._socket.recv(timeout=240))
+            answer = json.loads(self._socket.recv(timeout=HANGS))
             if answer.get("id") == self._number:
                 if "error" in answer:  # a tab between two documents has no picture
                     raise NotReady(answer["error"])
@@ -97,14 +99,29 @@ class Page:
             self.fingers([tuple(json.loads(found))])
         return bool(found)
 
-    def wait_for(self, seen: Callable[[NDArray[np.uint8]], bool], seconds: float = 240) -> NDArray[np.uint8]:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
+    def until(self, happened: Callable[[], object]) -> None:
+        """Wait for it, however slow the machine is; a page that hangs fails the test."""
+        end = time.monotonic() + HANGS
+        while not happened():
+            assert time.monotonic() < end, "the page did not answer"
+            time.sleep(0.2)
+
+    def wait_for(self, seen: Callable[[NDArray[np.uint8]], bool]) -> NDArray[np.uint8]:
+        """Wait until the scene looks so; returns it."""
+        found: list[NDArray[np.uint8]] = []
+
+        def looks_so() -> bool:
             with suppress(NotReady):
-                if seen(picture := self.scene()):
-                    return picture
-            time.sleep(1)
-        pytest.fail("the page did not come to show it")
+                found[:] = [self.scene()]
+                return seen(found[0])
+            return False
+
+        self.until(looks_so)
+        return found[0]
+
+    def wait_for_change(self, before: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Wait until the scene is clearly another one; returns it."""
+        return self.wait_for(lambda picture: bool(np.abs(picture.astype(float) - before).mean() > 5))
 
 
 @contextmanager
@@ -117,7 +134,7 @@ def browser(profile: Path, size: tuple[int, int] = (760, 520), *flags: str) -> I
         stderr=subprocess.DEVNULL,
     )
     try:
-        port_file, end = profile / "DevToolsActivePort", time.monotonic() + 60
+        port_file, end = profile / "DevToolsActivePort", time.monotonic() + HANGS
         while not (port_file.exists() and port_file.read_text().strip()):
             assert time.monotonic() < end, "the browser did not start"
             time.sleep(0.2)
@@ -137,6 +154,6 @@ def in_node(scripts: str, expression: str, **values: Any) -> Any:
         pytest.skip("needs node")
     given = "".join(f"const {name} = {json.dumps(value)};\n" for name, value in values.items())
     program = f"{scripts}\n{given}(async () => process.stdout.write(JSON.stringify(await {expression})))();"
-    done = subprocess.run([node, "-"], input=program, capture_output=True, text=True, timeout=240)
+    done = subprocess.run([node, "-"], input=program, capture_output=True, text=True, timeout=HANGS)
     assert done.returncode == 0, done.stderr[-1000:]
     return json.loads(done.stdout)

@@ -4,7 +4,6 @@ import http.client
 import json
 import re
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -145,37 +144,33 @@ def test_a_line_says_what_is_shown_and_what_is_to_come(run: RunFolder) -> None:
 
 
 IN_MAP = "document.getElementById('map').contentDocument"
+KEY = f"{IN_MAP}.defaultView.dispatchEvent(new KeyboardEvent({{!r}}, {{{{key: {{!r}}}}}}))"
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
 def test_the_page_follows_the_run_and_records_a_path(run: RunFolder, tmp_path: Path) -> None:
-    def until(happened: Callable[[], object]) -> None:
-        end = time.monotonic() + 120
-        while not happened():
-            assert time.monotonic() < end, "the page did not answer"
-            time.sleep(0.3)
-
     downloads = tmp_path / "downloads"
     with served(run) as server, browser(tmp_path / "profile", (900, 700)) as page:
         page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(downloads))
         page.call("Page.navigate", url=server.url)
-        until(lambda: "Shown: nothing yet (0 of 6" in (page.value("document.body.innerText") or ""))
+        page.until(lambda: "Shown: nothing yet (0 of 6" in (page.value("document.body.innerText") or ""))
         note_finished(run, STAGES[:3])
-        until(lambda: " points." in (page.value(f"{IN_MAP}.body.innerText") or ""))
-        until(lambda: page.value(f"{IN_MAP}.documentElement.dataset.ready"))
+        page.until(lambda: " points." in (page.value(f"{IN_MAP}.body.innerText") or ""))
+        page.until(lambda: page.value(f"{IN_MAP}.documentElement.dataset.ready"))
         page.screenshot(tmp_path / "points.png")
         page.value(f"{IN_MAP}.getElementById('keep').click()")
         for key in "wd":
-            for kind in ("keydown", "keyup"):
-                page.value(f"{IN_MAP}.defaultView.dispatchEvent(new KeyboardEvent({kind!r}, {{key: {key!r}}}))")
-                time.sleep(0.7)
+            before = page.scene()
+            page.value(KEY.format("keydown", key))
+            page.wait_for_change(before)
+            page.value(KEY.format("keyup", key))
         page.value(f"{IN_MAP}.getElementById('keep').click()")
         note_finished(run, STAGES[:4])
-        until(lambda: " Gaussians." in (page.value(f"{IN_MAP}.body.innerText") or ""))
-        until(lambda: page.value(f"{IN_MAP}.documentElement.dataset.ready"))
+        page.until(lambda: " Gaussians." in (page.value(f"{IN_MAP}.body.innerText") or ""))
+        page.until(lambda: page.value(f"{IN_MAP}.documentElement.dataset.ready"))
         page.screenshot(tmp_path / "map.png")
         page.value(f"{IN_MAP}.getElementById('save').click()")
-        until(lambda: list(downloads.glob("*-path.json")))
+        page.until(lambda: list(downloads.glob("*-path.json")))
     found, t = read_camera_path(next(downloads.glob("*-path.json"))), load_outcome(run).trajectory
     np.testing.assert_allclose(found.world_from_cam[0], t.world_from_cam[0], atol=1e-4)  # kept over the reload
     moved = found.world_from_cam[1, :3, 3] - found.world_from_cam[0, :3, 3]

@@ -6,7 +6,6 @@ import json
 import re
 import shutil
 import subprocess
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +29,7 @@ from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.run.target import Target
 from msgs_slam.pipelines.scene.world import FIRST, WORLD
 from msgs_slam.pipelines.system.progress import SilentProgress
-from tests.browser import browser, in_node
+from tests.browser import HANGS, browser, in_node
 
 OracleRun = Callable[..., RunFolder]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -128,24 +127,24 @@ def test_fingers_on_a_phone_measure_turn_and_zoom(page: tuple[Path, Outcome], tm
     with browser(tmp_path / "profile", (390, 844)) as tab:
         tab.be_a_phone()
         tab.call("Page.navigate", url=page[0].as_uri())
-        until(lambda: tab.value("document.documentElement.dataset.ready") == "1")
+        tab.until(lambda: tab.value("document.documentElement.dataset.ready") == "1")
         assert tab.value("document.documentElement.scrollWidth") == 390
         below = "document.getElementById('stage').getBoundingClientRect().bottom"
         assert 0.5 * 844 < tab.value(below) < 0.75 * 844  # controls have the rest
         assert tab.tap("document.getElementById('measure')")
-        until(lambda: "tap two places" in tab.value(text))
+        tab.until(lambda: "tap two places" in tab.value(text))
         tab.fingers([(150, 300)])
-        until(lambda: "second place" in tab.value(text))
+        tab.until(lambda: "second place" in tab.value(text))
         tab.fingers([(280, 340)])
-        until(lambda: "±" in tab.value(text))
+        tab.until(lambda: "±" in tab.value(text))
         before = tab.scene()
         tab.fingers([(150 + 10 * n, 300) for n in range(8)])
-        turned = tab.wait_for(lambda p: np.abs(p.astype(float) - before).mean() > 5)
+        turned = tab.wait_for_change(before)
         tab.fingers([(170 - 10 * n, 300) for n in range(8)], [(230 + 10 * n, 300) for n in range(8)])
-        tab.wait_for(lambda p: np.abs(p.astype(float) - turned).mean() > 5)
+        tab.wait_for_change(turned)
         assert "±" in tab.value(text)  # neither is a tap
-        assert tab.tap("document.getElementById('fold')")
-        until(lambda: tab.value(below) > 0.85 * 844)  # the map has the screen
+        tab.until(lambda: tab.tap("document.getElementById('fold')"))
+        tab.until(lambda: tab.value(below) > 0.85 * 844)  # the map has the screen
 
 
 def script(*names: str) -> str:
@@ -210,19 +209,12 @@ def test_the_tape_is_true_within_what_it_states(page: tuple[Path, Outcome], trut
     assert np.mean(error < 3 * sd) > 0.85
 
 
-def until(happened: Callable[[], object]) -> None:
-    end = time.monotonic() + 60
-    while not happened():
-        assert time.monotonic() < end, "the page did not answer"
-        time.sleep(0.2)
-
-
 def screenshot(address: str, folder: Path) -> Path:
     target = folder / "shot.png"
     words = ["--headless", "--no-sandbox", "--no-first-run", "--disable-background-networking", "--disable-sync"]
     words += ["--disable-component-update", "--disable-quic", "--hide-scrollbars", f"--user-data-dir={folder / 'user'}"]
     words += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--virtual-time-budget=20000"]
     words += ["--window-size={},{}".format(*SIZE), f"--screenshot={target}", address]
-    done = subprocess.run([str(CHROMIUM), *words], capture_output=True, text=True, timeout=180)
+    done = subprocess.run([str(CHROMIUM), *words], capture_output=True, text=True, timeout=HANGS)
     assert target.exists(), done.stderr[-1000:]
     return target
