@@ -2,8 +2,9 @@
 
 import importlib.metadata
 import importlib.util
+import os
+import re
 import shlex
-import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
@@ -57,9 +58,11 @@ def install_command(*requirements: str) -> str:
     return " ".join([by, *map(shell_word, requirements)])
 
 
-def shell_word(text: str) -> str:
-    """Return the text as one word of a command for this system's shell."""
-    return subprocess.list2cmdline([text]) if sys.platform == "win32" else shlex.quote(text)
+def shell_word(text: str, windows: bool = os.name == "nt") -> str:
+    """Return the text as one word of a command for the system's shell; on Windows no path holds a quotation mark."""
+    if not windows:
+        return shlex.quote(text)
+    return text if re.fullmatch(r"[\w:\\/.-]+", text) else f'"{text}"'
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 from cli_runs import QUICK, FinishedRun, elsewhere
 from test_kill_and_resume import digests
 
+from msgs_slam.formats.errors import shell_word
 from msgs_slam.formats.reading import leads_out
 from msgs_slam.pipelines.run.lock import SOFT_LOCK
 
@@ -104,6 +106,12 @@ def test_the_package_is_whole_where_git_makes_no_links(tmp_path: Path) -> None:
         made[out.name] = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
     assert made["without"] == made["with"]
     assert {"msgs_slam/formats/ply.py", "msgs_slam/pipelines/depth/completion/weights.npz"} < made["with"]
+
+
+def test_names_in_commands_are_quoted_as_each_shell_reads_them() -> None:
+    names = ("C:\\runs\\room.msgs", "my room.msgs", "a&b.mp4", "it's.mp4")
+    assert [shell_word(n, windows=True) for n in names] == [names[0], *(f'"{n}"' for n in names[1:])]
+    assert [shlex.split(shell_word(n, windows=False)) for n in names] == [[n] for n in names]
 
 
 @pytest.mark.parametrize(("name", "out"), [("a\\b.jpg", False), ("..\\b.jpg", True), ("c:b.jpg", True), ("\\b", True)])
