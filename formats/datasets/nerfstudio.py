@@ -219,25 +219,29 @@ def write_transforms(
     world_from_cam: NDArray[np.float64],
     ply_path: str | None = None,
     mask_paths: Sequence[str] = (),
+    depth_paths: Sequence[str] = (),
 ) -> None:
     """Write a transforms.json of one pinhole camera.
 
     image_paths: N, relative to the file; world_from_cam (N, 4, 4), camera axes x right, y down, z forward, which
     are turned into OpenGL's; the world stays as it is. `ply_path` names a point cloud to start a splat from;
-    mask_paths: N, or none, masks of the images, black where these are not to be learned from.
+    mask_paths: N, or none, masks of the images, black where these are not to be learned from; depth_paths: N, or
+    none, their depth in thousandths of the world's unit.
     Raises ValueError for shapes that do not fit, InputError when the disk refuses.
     """
-    if world_from_cam.shape != (len(image_paths), 4, 4) or len(mask_paths) not in (0, len(image_paths)):
+    beside = {"depth_file_path": depth_paths, "mask_path": mask_paths}
+    if world_from_cam.shape != (len(image_paths), 4, 4) or {len(p) for p in beside.values()} - {0, len(image_paths)}:
         raise ValueError(
-            f"write_transforms: got {len(image_paths)} images, {len(mask_paths)} masks, poses {world_from_cam.shape}"
+            f"write_transforms: got {len(image_paths)} images, {len(mask_paths)} masks, {len(depth_paths)} depth maps, "
+            f"poses {world_from_cam.shape}"
         )
-    masks = [{"mask_path": name} for name in mask_paths] or [{}] * len(image_paths)
+    others = [{key: paths[i] for key, paths in beside.items() if paths} for i in range(len(image_paths))]
     names = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx}
     table: dict[str, object] = {
         "camera_model": "OPENCV", **names, "cy": camera.cy, **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
         "frames": [
-            {"file_path": name, **mask, "transform_matrix": matrix.tolist()}
-            for name, mask, matrix in zip(image_paths, masks, world_from_cam @ OPENCV_FROM_OPENGL, strict=True)
+            {"file_path": name, **other, "transform_matrix": matrix.tolist()}
+            for name, other, matrix in zip(image_paths, others, world_from_cam @ OPENCV_FROM_OPENGL, strict=True)
         ],
         **({} if ply_path is None else {"ply_file_path": ply_path}),
     }  # fmt: skip

@@ -14,7 +14,7 @@ from ...formats.datasets.sequence import distortion_names
 from ...formats.glb import read_textured_glb
 from ...formats.reading import read_bytes
 from ...formats.textfile import read_json, read_text
-from ..config import Config, config_to_dict
+from ..config import SOURCE_LIST, Config, config_to_dict
 from ..export.kinds import IMAGES, README, WEB_PAGE
 from ..export.scene import lengths
 from ..geometry.sparse_model import SparseModel
@@ -74,7 +74,13 @@ def _report(outcome: Outcome, target: Path, progress: Progress) -> str:
             _settings_section(outcome),
         ]
     )
-    return page(f"{run.place.name} – report", body)
+    return page(f"{_title(outcome)} – report", body)
+
+
+def _title(outcome: Outcome) -> str:
+    """The name of the video or folder that was reconstructed; that of the run where it is one of several, or a piece."""
+    run, source = outcome.run, Path(outcome.run.source.path).name
+    return run.place.name if run.is_piece or source in ("", SOURCE_LIST) else source
 
 
 def _figures(outcome: Outcome) -> list[tuple[str, str]]:
@@ -88,7 +94,8 @@ def _figures(outcome: Outcome) -> list[tuple[str, str]]:
     if outcome.gaussian_map is not None:
         pairs.append(("Gaussians", f"{len(outcome.gaussian_map):,}"))
     if outcome.keyframe_psnr is not None:
-        pairs.append(("keyframe PSNR, dB", f"{outcome.keyframe_psnr:.1f}"))
+        size = outcome.calibration.intrinsics.at_most(outcome.config.mapping.max_side)
+        pairs.append((f"keyframe PSNR, dB at {max(size.width, size.height)} pixels", f"{outcome.keyframe_psnr:.1f}"))
     return pairs
 
 
@@ -100,7 +107,7 @@ def _heading(outcome: Outcome, target: Path) -> str:
     pairs.append(("seconds", f"{sum(r.seconds for r in outcome.records.values()):.0f}"))
     source = escape(str(outcome.run.source.path))
     after = _AFTER.get(outcome.map_stage or outcome.pose_stage, "")
-    head, run = f'<h1>{escape(outcome.run.place.name)}</h1><p class="sub">Source: {source}{after}</p>', outcome.run
+    head, run = f'<h1>{escape(_title(outcome))}</h1><p class="sub">Source: {source}{after}</p>', outcome.run
     in_run = target.resolve().parent == run.root.resolve() and run.has("export", WEB_PAGE)
     link = f'<p><a href="export/{WEB_PAGE}">Open the map</a> (one file, easy to share).</p>' if in_run else ""
     return head + chips(pairs) + link
@@ -292,7 +299,7 @@ def _depth_scale(nearest: float, farthest: float, unit: str) -> str:
     colors = ",".join("rgb({},{},{})".format(*c) for c in depth_picture(depths[None], nearest, farthest)[0].tolist())
     low, middle, high = (f"{depths[k]:.2g}" for k in (0, 4, 8))
     bar = f'<i style="background:linear-gradient(to right,{colors})"></i>'
-    middle = f"<span>(median {middle})</span>"
+    middle = f"<span>(centre {middle})</span>"
     return f'<div class="legend scale">depth, {escape(unit)}: {low} {bar} {high} {middle}</div>'
 
 

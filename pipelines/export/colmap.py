@@ -5,6 +5,7 @@ Structure from motion works on smaller images than trainers want: `images/` is r
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -53,17 +54,27 @@ Points = tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.int64], NDArra
 """points (P, 3), colors (P, 3); and of their observations obs_image, obs_point (O,), obs_xy (O, 2)."""
 
 
+def placed_frames(outcome: Outcome) -> list[Frame]:
+    """Return the frames of which both rotation and place are known, in the order of the trajectory."""
+    frame_of, trajectory = {f.id: f for f in outcome.frames}, outcome.trajectory
+    return [frame_of[int(i)] for i in trajectory.frame_ids[trajectory.is_placed]]
+
+
 def write_colmap(scene: ExportScene, target: Target) -> None:
     """Write `images/` with the frames whose place is known, `sparse/0` (binary and text, and the points as a PLY to
-    start from), transforms.json, and `masks/` where frames have any.
+    start from), transforms.json, and `masks/` where frames have any."""
+    write_data_set(scene, target)
+
+
+def write_data_set(scene: ExportScene, target: Target, depths: Sequence[str] = ()) -> None:
+    """Write what `write_colmap` does, with the names of the frames' `depths` in transforms.json.
 
     It has the axes of splat files, as the PLYs of the map: what is trained from it stands as the map does.
     """
     outcome, turn = scene.outcome, Similarity(1.0, scene.world.image_axes_from_exported, np.zeros(3))
     trajectory, small = outcome.trajectory.moved(turn.apply_to_poses), outcome.calibration.intrinsics
     posed = np.flatnonzero(trajectory.is_placed)
-    frame_of = {f.id: f for f in outcome.frames}
-    frames = [frame_of[int(i)] for i in trajectory.frame_ids[posed]]
+    frames = placed_frames(outcome)
     names = tuple(f.name for f in frames)
     model_folder = target.path(SPARSE)
     k = _write_images(scene, frames, target.path(IMAGES))
@@ -80,7 +91,7 @@ def write_colmap(scene: ExportScene, target: Target) -> None:
     if start:
         write_point_ply(target.folder / start, points, colors)
     paths, transforms = [f"{IMAGES}/{name}" for name in names], target.path("transforms.json")
-    write_transforms(transforms, Camera(*camera), paths, trajectory.world_from_cam[posed], start, masks)
+    write_transforms(transforms, Camera(*camera), paths, trajectory.world_from_cam[posed], start, masks, depths)
 
 
 def write_trajectory(scene: ExportScene, target: Target) -> None:

@@ -97,6 +97,20 @@ EXPORTS = (
         "colmap.write_colmap", settings=("image_side",), when="always", also=("nerfstudio", "transforms"),
     ),
     Export(
+        "depth", "the same data set with a depth map for each image",
+        (
+            ExportedFile(
+                "depth/",
+                "with all files of the data set beside it: NAME.png for the image NAME, the depth of the map along the "
+                "optical axis in thousandths of the unit (millimetres, where it is the metre), 16 bits, 0 is unknown; "
+                "transforms.json names them (depth_file_path)",
+                "nerfstudio (ns-train depth-nerfacto --data THIS_FOLDER)",
+                ("depth", IMAGES, "sparse", "masks", "transforms.json"),
+            ),
+        ),
+        "depth.write_depth", settings=("image_side",),
+    ),
+    Export(
         "tum", "poses of all images of the source with their times",
         (
             ExportedFile(

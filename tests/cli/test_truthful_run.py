@@ -52,7 +52,7 @@ def test_every_place_gives_one_psnr(finished_run: FinishedRun, copied_run: Calla
     assert value > 15
     assert f"keyframe_psnr {figure_text(value)}" in invoke("status", run).stdout
     assert invoke("report", run, "-q").exit_code == 0
-    assert f"<b>{value:.1f}</b><span>keyframe PSNR, dB</span>" in (run / "report.html").read_text()
+    assert f"<b>{value:.1f}</b><span>keyframe PSNR, dB at 160 pixels</span>" in (run / "report.html").read_text()
     table = invoke("evaluate", run, "--truth", finished_run.truth, "-q").stdout
     assert table.splitlines()[2].startswith("| what"), "the table first"
     assert "Umeyama" not in table

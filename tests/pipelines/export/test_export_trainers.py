@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 from finished import note_finished
 
-from msgs_slam.formats.datasets import Dataset
+from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.formats.images import read_rgb, write_rgb
 from msgs_slam.pipelines.config import Config, FramesConfig
 from msgs_slam.pipelines.export import colmap
@@ -158,6 +158,20 @@ def test_images_are_as_large_as_the_source_and_fit_their_camera(
         assert {mask.shape[::-1] for mask in masks.values()} == {size}
         assert [round(float(masks[n].mean()), 2) for n in (frame.name, truth.names[4])] == [0.25, 0]
     assert not caplog.text
+
+
+def test_depth_maps_are_named_and_true(oracle_run: OracleRun, truth: Dataset, tmp_path: Path) -> None:
+    run = oracle_run()
+    note_finished(run, STAGES[:4], source="gone.mp4")
+    export_run(run, tmp_path / "out", "depth")
+    found = open_sequence(tmp_path / "out", "nerfstudio")
+    assert found.names == truth.names
+    for i in (0, 13, 31):
+        depth, true = found.depth(i), truth.depth(i)
+        both = (depth > 0) & (true > 0)
+        assert both.mean() > 0.9
+        assert 0 < np.median(np.abs(depth - true)[both] / true[both]) < 0.02
+    assert pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0").num_images() == len(truth.names)
 
 
 def test_another_source_under_the_same_name_is_not_taken(
