@@ -78,7 +78,7 @@ def _report(outcome: Outcome, target: Path, progress: Progress) -> str:
 
 
 def _title(outcome: Outcome) -> str:
-    """The name of the video or folder that was reconstructed; that of the run where it is one of several, or a piece."""
+    """The name of the video or folder that was reconstructed; of several videos, and of a piece, that of the run."""
     run, source = outcome.run, Path(outcome.run.source.path).name
     return run.place.name if run.is_piece or source in ("", SOURCE_LIST) else source
 
