@@ -229,13 +229,13 @@ def write_transforms(
     none, their depth in thousandths of the world's unit.
     Raises ValueError for shapes that do not fit, InputError when the disk refuses.
     """
-    beside = {"depth_file_path": depth_paths, "mask_path": mask_paths}
-    if world_from_cam.shape != (len(image_paths), 4, 4) or {len(p) for p in beside.values()} - {0, len(image_paths)}:
+    paths_of = {"depth_file_path": depth_paths, "mask_path": mask_paths}
+    if world_from_cam.shape != (len(image_paths), 4, 4) or {len(p) for p in paths_of.values()} - {0, len(image_paths)}:
         raise ValueError(
             f"write_transforms: got {len(image_paths)} images, {len(mask_paths)} masks, {len(depth_paths)} depth maps, "
             f"poses {world_from_cam.shape}"
         )
-    others = [{key: paths[i] for key, paths in beside.items() if paths} for i in range(len(image_paths))]
+    others = [{key: paths[i] for key, paths in paths_of.items() if paths} for i in range(len(image_paths))]
     names = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx}
     table: dict[str, object] = {
         "camera_model": "OPENCV", **names, "cy": camera.cy, **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),

@@ -148,6 +148,7 @@ def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:
     expected = {
         "colmap": "transforms.json", "ply": "point_cloud.ply", "spz": "point_cloud.spz", "sog": "point_cloud.sog",
         "glb": "point_cloud.glb", "html": "map.html", "tiles": "tiles/tileset.json", "tum": "trajectory.txt",
+            "depth": "depth",
     }  # fmt: skip
     for only in [row.kind for row in EXPORTS if row.needs == "map" and row.kind != "mesh"]:
         export_run(run, tmp_path / only, only, settings=ExportConfig(axes="first"))
