@@ -48,9 +48,9 @@ class StageEvent:
 
     @property
     def left_text(self) -> str:
-        """; about 4 min left, or nothing."""
-        seconds = self.left()
-        return f"; {about(seconds)} left" if seconds else ""
+        """; about 4 min left, or nothing. While only the first stage has ended, half or twice as long is as likely."""
+        ended, seconds = self.index - (self.state == BEGUN), self.left()
+        return f"; {about(seconds) if ended > 1 else between(seconds / 2, 2 * seconds)} left" if seconds else ""
 
 
 def about(seconds: float) -> str:
@@ -58,6 +58,13 @@ def about(seconds: float) -> str:
     if seconds < 55:
         return f"about {max(10 * round(seconds / 10), 10)} s"
     return f"about {round(seconds / 60)} min" if seconds < 90 * 60 else f"about {round(seconds / 3600)} h"
+
+
+def between(low: float, high: float) -> str:
+    """20 to 80 s, 2 to 8 min, 1 to 3 h."""
+    unit, length = ("s", 10) if high < 100 else ("min", 60) if high < 90 * 60 else ("h", 3600)
+    first, last = (max(round(seconds / length), 1) * (10 if unit == "s" else 1) for seconds in (low, high))
+    return f"{first} to {last} {unit}" if first < last else about(high)
 
 
 class Progress(Protocol):

@@ -17,6 +17,7 @@ from msgs_slam.pipelines.system.progress import (
     StageEvent,
     WithinStage,
     about,
+    between,
 )
 
 
@@ -51,6 +52,12 @@ def test_words_for_a_time() -> None:
     ]  # fmt: skip
 
 
+def test_a_first_guess_is_a_range() -> None:
+    assert [between(s / 2, 2 * s) for s in (3, 44, 100, 240, 5000)] == [
+        "about 10 s", "20 to 90 s", "1 to 3 min", "2 to 8 min", "1 to 3 h"
+    ]  # fmt: skip
+
+
 def test_bars_name_their_stage_and_close_at_their_count(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", io.StringIO())
     bars = BarProgress()
@@ -69,7 +76,7 @@ def test_bars_name_their_stage_and_close_at_their_count(monkeypatch: pytest.Monk
     last = [piece for piece in said.replace("\n", "\r").split("\r") if "|" in piece]
     title = "[2/6 depth and classes]"
     assert any(piece.startswith(f"{title} depth") and "100%" in piece and "2/2" in piece for piece in last)
-    assert "about 4 min to the end" in said
+    assert "2 to 8 min to the end" in said, "one stage has ended: a guess"
     assert "[2/6 depth and classes] camera model" in said
     assert "100%" in last[-1]
     assert "[2/6 depth and classes] done in 96 s; about 4 min left" in said
