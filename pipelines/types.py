@@ -12,7 +12,7 @@ Conventions
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -221,8 +221,7 @@ class Trajectory:
     """A pose for every picked frame, or the reason why there is none.
 
     frame_ids (N,) int, timestamps (N,) seconds, cam_from_world (N, 4, 4) float64 (identity where lost),
-    is_keyframe (N,) bool, lost_reasons: N strings, "" where the frame is posed. by_rotation (N,) bool: of the pose only
-    the rotation is known, the frame was put at its neighbour's position; by default of none.
+    is_keyframe (N,) bool, lost_reasons: N strings, "" where the frame is posed.
     """
 
     frame_ids: NDArray[np.int64]
@@ -230,16 +229,12 @@ class Trajectory:
     cam_from_world: NDArray[np.float64]
     is_keyframe: NDArray[np.bool_]
     lost_reasons: tuple[str, ...]
-    by_rotation: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
 
     def __post_init__(self) -> None:
         n = len(self.frame_ids)
-        if not len(self.by_rotation):
-            object.__setattr__(self, "by_rotation", np.zeros(n, bool))
         require_shape("timestamps", self.timestamps, (n,))
         require_shape("cam_from_world", self.cam_from_world, (n, 4, 4))
         require_shape("is_keyframe", self.is_keyframe, (n,))
-        require_shape("by_rotation", self.by_rotation, (n,))
         if len(self.lost_reasons) != n:
             raise ValueError(f"lost_reasons: got {len(self.lost_reasons)}, expected {n}")
         if (self.is_keyframe & ~self.is_posed).any():
@@ -249,11 +244,6 @@ class Trajectory:
     def is_posed(self) -> NDArray[np.bool_]:
         """Whether each frame has a pose, (N,)."""
         return np.array([not reason for reason in self.lost_reasons], dtype=bool)
-
-    @property
-    def is_placed(self) -> NDArray[np.bool_]:
-        """(N,) bool: of the pose both rotation and place are known."""
-        return self.is_posed & ~self.by_rotation
 
     @property
     def world_from_cam(self) -> NDArray[np.float64]:
@@ -274,20 +264,13 @@ class Trajectory:
         """Select these frames."""
         t, rows = self, np.flatnonzero(np.isin(self.frame_ids, frame_ids))
         reasons = tuple(t.lost_reasons[r] for r in rows)
-        return Trajectory(
-            t.frame_ids[rows],
-            t.timestamps[rows],
-            t.cam_from_world[rows],
-            t.is_keyframe[rows],
-            reasons,
-            t.by_rotation[rows],
-        )
+        return Trajectory(t.frame_ids[rows], t.timestamps[rows], t.cam_from_world[rows], t.is_keyframe[rows], reasons)
 
     def split(self, hold_out: int) -> tuple[list[int], list[int]]:
-        """Return the ids of the keyframes to use, and those held out of the placed frames: every `hold_out`-th, from
+        """Return the ids of the keyframes to use, and those held out of the posed frames: every `hold_out`-th, from
         half of that on."""
-        placed, keyframes = (self.frame_ids[rows].tolist() for rows in (self.is_placed, self.is_keyframe))
-        held = [i for i in placed if hold_out > 0 and i % hold_out == hold_out // 2]
+        posed, keyframes = (self.frame_ids[rows].tolist() for rows in (self.is_posed, self.is_keyframe))
+        held = [i for i in posed if hold_out > 0 and i % hold_out == hold_out // 2]
         return [i for i in keyframes if i not in set(held)], held
 
 

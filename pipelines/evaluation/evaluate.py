@@ -87,7 +87,7 @@ def evaluate_outcome(
             log.warning("class map %s: there is no class %s. What joins only these is left out", class_map.name, listed)
     matching = match_classes(outcome.classes.names, outcome.vocabulary, truth.class_names, class_map)
     trajectory, alignment = trajectory_cells(outcome, matched)
-    usable = outcome.trajectory.frame_ids[outcome.trajectory.is_placed & matched.has_pose]
+    usable = outcome.trajectory.frame_ids[outcome.trajectory.is_posed & matched.has_pose]
     errors = [] if alignment is None else [[int(i), float(e)] for i, e in zip(usable, alignment.errors, strict=True)]
     why = {"missing": f"mapping is not done; the last stage is {outcome.pose_stage}"}
     of_map: dict[str, Any] = {"images": why, "depth": why, "labels": why, "views": []}
@@ -124,7 +124,6 @@ def frame_cells(outcome: Outcome, matched: MatchedTruth) -> dict[str, Any]:
     return images | {
         "picked": len(t.frame_ids),
         "posed": int(t.is_posed.sum()),
-        "by rotation alone": int(t.by_rotation.sum()),
         "keyframes": int(t.is_keyframe.sum()),
         "with true pose": int(matched.has_pose.sum()),
         "with true image": int((matched.image >= 0).sum()),
@@ -145,7 +144,7 @@ def camera_cells(outcome: Outcome, truth: Dataset) -> dict[str, Any]:
 def trajectory_cells(outcome: Outcome, matched: MatchedTruth) -> tuple[dict[str, Any], AbsoluteError | None]:
     """ATE and RPE in the truth's unit, and the alignment over all frames: Sim(3), SE(3) where both are metric."""
     t = outcome.trajectory
-    usable = t.is_placed & matched.has_pose
+    usable = t.is_posed & matched.has_pose
     if usable.sum() < 3:
         why = f"only {int(usable.sum())} posed frames have a true pose, three are needed"
         return {"missing": why}, None
@@ -201,7 +200,7 @@ def _ate_of_every(every: Trajectory, sequence: Dataset, with_scale: bool) -> dic
     if not has_times(sequence):
         return {"missing": "the truth has no times"}
     truth = match_by_time(every.timestamps, sequence)
-    rows = every.is_placed & truth.has_pose
+    rows = every.is_posed & truth.has_pose
     return _ate(every.centers[rows], truth.world_from_cam[rows, :3, 3], with_scale)
 
 
@@ -312,7 +311,7 @@ def _jobs(
     t = outcome.trajectory
     keyframes, held_out = t.split(outcome.config.mapping.hold_out)
     used = {*keyframes, *held_out, *t.frame_ids[t.is_keyframe].tolist()}
-    between = [i for i in t.frame_ids[t.is_placed].tolist() if i not in used]
+    between = [i for i in t.frame_ids[t.is_posed].tolist() if i not in used]
     poses = dict(zip(t.frame_ids.tolist(), t.cam_from_world, strict=True))
     jobs = []
     for kind, ids in ((KEYFRAMES, keyframes), (HELD_OUT, held_out), (BETWEEN, between)):

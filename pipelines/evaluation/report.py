@@ -88,8 +88,6 @@ def _figures(outcome: Outcome) -> list[tuple[str, str]]:
     pairs = [("frames posed", f"{int(t.is_posed.sum())} / {len(t.frame_ids)}")]
     if outcome.every is not None:
         pairs.append(("images of the source posed", f"{outcome.every.is_posed.sum()} / {len(outcome.every.frame_ids)}"))
-    if t.by_rotation.any():
-        pairs.append(("of them by rotation alone", str(int(t.by_rotation.sum()))))
     pairs.append(("keyframes", str(int(t.is_keyframe.sum()))))
     if outcome.gaussian_map is not None:
         pairs.append(("Gaussians", f"{len(outcome.gaussian_map):,}"))

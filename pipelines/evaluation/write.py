@@ -190,8 +190,6 @@ def evaluation_rows(result: dict[str, Any]) -> list[Row]:
     of = "{picked} picked, {keyframes} keyframes, {with true pose} with a true pose"
     if "images" in frames:
         of += "; of the source's {images} images {images posed} are posed"
-    if frames.get("by rotation alone"):
-        of += "; {by rotation alone} by rotation alone, which no error of a place counts"
     rows = [_row("frames posed", frames, "{posed}", of)]
     why = camera.get("missing")
     known = {key: value for key, value in camera.items() if key != "missing"}

@@ -34,7 +34,6 @@ from ..source.picking import reduce_image, reduced_size
 from ..source.recording import Recording, open_recording
 from ..system.parallel import parallel_map
 from ..system.threads import get_threads
-from ..system.wording import stretches
 from ..types import Frame, Intrinsics
 from .kinds import IMAGES
 from .scene import ExportScene, lengths
@@ -54,14 +53,14 @@ Points = tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.int64], NDArra
 """points (P, 3), colors (P, 3); and of their observations obs_image, obs_point (O,), obs_xy (O, 2)."""
 
 
-def placed_frames(outcome: Outcome) -> list[Frame]:
-    """Return the frames of which both rotation and place are known, in the order of the trajectory."""
+def posed_frames(outcome: Outcome) -> list[Frame]:
+    """Return the posed frames, in the order of the trajectory."""
     frame_of, trajectory = {f.id: f for f in outcome.frames}, outcome.trajectory
-    return [frame_of[int(i)] for i in trajectory.frame_ids[trajectory.is_placed]]
+    return [frame_of[int(i)] for i in trajectory.frame_ids[trajectory.is_posed]]
 
 
 def write_colmap(scene: ExportScene, target: Target) -> None:
-    """Write `images/` with the frames whose place is known, `sparse/0` (binary and text, and the points as a PLY to
+    """Write `images/` with the posed frames, `sparse/0` (binary and text, and the points as a PLY to
     start from), transforms.json, and `masks/` where frames have any."""
     write_data_set(scene, target)
 
@@ -73,8 +72,8 @@ def write_data_set(scene: ExportScene, target: Target, depths: Sequence[str] = (
     """
     outcome, turn = scene.outcome, Similarity(1.0, scene.world.image_axes_from_exported, np.zeros(3))
     trajectory, small = outcome.trajectory.moved(turn.apply_to_poses), outcome.calibration.intrinsics
-    posed = np.flatnonzero(trajectory.is_placed)
-    frames = placed_frames(outcome)
+    posed = np.flatnonzero(trajectory.is_posed)
+    frames = posed_frames(outcome)
     names = tuple(f.name for f in frames)
     model_folder = target.path(SPARSE)
     k = _write_images(scene, frames, target.path(IMAGES))
@@ -96,11 +95,9 @@ def write_data_set(scene: ExportScene, target: Target, depths: Sequence[str] = (
 
 def write_trajectory(scene: ExportScene, target: Target) -> None:
     """Write the poses of all posed images of the source, where only frames have one of these, and of panoramas those of
-    their middle; a comment names those that only turned."""
+    their middle."""
     outcome = scene.outcome
     t, note = outcome.every or outcome.trajectory, lengths(outcome.metres, outcome.metric)
-    if t.by_rotation.any():
-        note += f"\nTurned only, so put at their neighbours' positions: frames {stretches(t.frame_ids[t.by_rotation])}."
     posed = np.flatnonzero(t.is_posed)
     if outcome.every is None:
         posed = posed[t.frame_ids[posed] < rig_of(outcome.calibration.directions, len(outcome.frames)).stations]

@@ -9,7 +9,7 @@ from ...formats.images import write_grey_png
 from ..render.api import median_depth
 from ..run.outcome import maps_around
 from ..run.target import Target
-from .colmap import placed_frames, write_data_set
+from .colmap import posed_frames, write_data_set
 from .scene import ExportScene
 
 DEPTH = "depth"
@@ -23,7 +23,7 @@ def write_depth(scene: ExportScene, target: Target) -> None:
     thousandths of the world's unit, 16 bits, as large as the frames; 0 where the map has nothing, or farther than 65
     units. transforms.json names them."""
     outcome = scene.outcome
-    frames, near, trajectory = placed_frames(outcome), maps_around(outcome), outcome.trajectory
+    frames, near, trajectory = posed_frames(outcome), maps_around(outcome), outcome.trajectory
     names = [f"{DEPTH}/{frame.name}.png" for frame in frames]
     folder = target.path(DEPTH)
     for frame, name in zip(frames, names, strict=True):

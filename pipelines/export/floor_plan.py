@@ -34,7 +34,7 @@ def write_floor_plan(scene: ExportScene, target: Target) -> None:
     if not outcome.metric and (metres := outcome.metres) is not None:
         spread, about = metres.relative_sd, metres.text
     unit = "m" if about or outcome.metric else "units"
-    path = outcome.trajectory.centers[outcome.trajectory.is_placed]
+    path = outcome.trajectory.centers[outcome.trajectory.is_posed]
     text = floor_plan(walls, path, outcome.run.place.stem, scene.metres_per_unit, unit, about, spread)
     write_text(target.path(FLOOR_PLAN), text)
 

@@ -75,9 +75,8 @@ EXPORTS = (
         (
             ExportedFile(
                 "images/, sparse/0/",
-                "the undistorted frames with a known place, as large as the source's up to export.image_side, and "
-                "their camera (a pinhole), poses and points to start from (binary, text, points3D.ply). A frame of "
-                "which only the rotation is known is in trajectory.txt alone",
+                "the undistorted posed frames, as large as the source's up to export.image_side, and their camera (a "
+                "pinhole), poses and points to start from (binary, text, points3D.ply)",
                 "COLMAP, pycolmap, gsplat (simple_trainer.py default --data_dir THIS_FOLDER --data_factor 1), the "
                 "original trainer (train.py -s THIS_FOLDER)",
                 (IMAGES, "sparse"),

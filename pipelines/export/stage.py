@@ -91,7 +91,7 @@ def run(context: StageContext) -> dict[str, Any]:
     for export in (export for export in kinds if export.kind != "mesh"):
         export.writer()(scene, target)
     write_notes(scene, target, metres)
-    figures = {"images": int(scene.outcome.trajectory.is_placed.sum()), "gaussians": len(scene.outcome.require_map())}
+    figures = {"images": int(scene.outcome.trajectory.is_posed.sum()), "gaussians": len(scene.outcome.require_map())}
     scene = scene.without_map()
     release_free_memory()
     for export in (export for export in kinds if export.kind == "mesh"):

@@ -111,7 +111,7 @@ def _cameras(outcome: Outcome, upright: NDArray[np.float64]) -> dict[str, Any]:
     """Some cameras in order, all their places, and the frame of an image: sides over focal length."""
     t, k = outcome.trajectory, outcome.calibration.intrinsics
     stations = rig_of(outcome.calibration.directions, len(outcome.frames)).stations
-    rows = [int(row) for row in np.flatnonzero(t.is_placed) if t.frame_ids[row] < stations]
+    rows = [int(row) for row in np.flatnonzero(t.is_posed) if t.frame_ids[row] < stations]
     centers = t.centers @ upright.T
     means = outcome.require_map().means.cpu().numpy().astype(np.float64) @ upright.T
     middle = np.median(means, axis=0) if not rows else centers[rows[0]]

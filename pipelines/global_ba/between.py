@@ -42,7 +42,6 @@ _NEIGHBOURS = 2
 """Keyframes, and picked frames, on each side by which an image is placed."""
 _STATIONS = 1 << 26
 """More than a source has images: image i in direction c has the number c * _STATIONS + i."""
-_TURNED = "of the frames beside it only the rotation is known"
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,6 @@ def with_placed(run: RunFolder, trajectory: Trajectory, placed: list[Placed]) ->
         np.concatenate([t.cam_from_world[own], [p.cam_from_world for p in placed]])[order],
         np.concatenate([t.is_keyframe[own], none])[order],
         tuple(reasons[i] for i in order),
-        np.concatenate([t.by_rotation[own], none])[order],
     )
 
 
@@ -175,16 +173,14 @@ class Placer:
         numbers = [f.source_index + f.id // rig.stations * _STATIONS for f in frames]
         self.picked = {f.source_index for f in around}
         self._in_order = np.array(sorted(self.picked))
-        self.lost = {
-            n: why or _TURNED for n, why, ok in zip(numbers, t.lost_reasons, t.is_placed, strict=True) if not ok
-        }
+        self.lost = {n: why for n, why in zip(numbers, t.lost_reasons, strict=True) if why}
         self._times = dict(zip(numbers, t.timestamps.tolist(), strict=True))
         # The points are where structure from motion and loops have put them; mapping may have moved keyframes since.
         ids = np.array(numbers, np.int64)
         self._keyframes = ids[np.searchsorted(t.frame_ids, model.frame_ids)]
         self._final = t.cam_from_world[np.searchsorted(t.frame_ids, model.frame_ids)]
         self._fitted = model.cam_from_world
-        known = t.is_placed
+        known = t.is_posed
         poses = self._follow(ids[known], t.cam_from_world[known], self._final, self._fitted)
         self._poses = dict(zip(ids[known].tolist(), poses, strict=True))
         self._posed = np.array(sorted(self._poses), np.int64)

@@ -99,7 +99,7 @@ def track_by_map(context: StageContext) -> dict[str, Any]:
         context.warn(f"{len(slam.lost)} frames have no pose: {stretches(slam.lost)}")
     metric = bool(context.run.load(FIGURES["proxy"]).get("metric", False))
     figures = {
-        "frames": len(frames), "posed": len(slam.poses), "keyframes": len(slam.fields), "by_rotation": 0,
+        "frames": len(frames), "posed": len(slam.poses), "keyframes": len(slam.fields),
         "lost": {str(i): reason for i, reason in slam.lost.items()}, "scale": "metric" if metric else "free",
         "scale_relative_sd": None, "method": "paper", "gaussians": len(slam.gaussians), "pieces": [],
     }  # fmt: skip

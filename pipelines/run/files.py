@@ -210,8 +210,11 @@ DESCRIPTORS: RunFile[dict[int, NDArray[np.float32]]] = RunFile(
 def _trajectory(arrays: Arrays) -> Trajectory:
     require_increasing("frame_ids", arrays["frame_ids"])
     require_rigid("the poses", arrays["cam_from_world"])
-    reasons = tuple(str(r) for r in arrays["lost_reasons"])
-    return Trajectory(**{k: a for k, a in arrays.items() if k != "lost_reasons"}, lost_reasons=reasons)
+    reasons = [str(r) for r in arrays["lost_reasons"]]
+    known = {k: a for k, a in arrays.items() if k not in ("lost_reasons", "by_rotation")}
+    for row in np.flatnonzero(arrays.get("by_rotation", ())):  # a rotation without a place is no pose
+        reasons[row], known["cam_from_world"][row] = "only its rotation is known", np.eye(4)
+    return Trajectory(**known, lost_reasons=tuple(reasons))
 
 
 TRAJECTORY: RunFile[Trajectory] = RunFile(

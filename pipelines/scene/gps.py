@@ -55,7 +55,7 @@ def world_on_earth(outcome: Outcome, world: World, gps: str) -> tuple[World, str
 def _laid_out(outcome: Outcome, world: World, places: Array) -> World | str:
     if world.axes != "up":
         return "the gravity direction is not known"
-    posed = outcome.trajectory.is_placed
+    posed = outcome.trajectory.is_posed
     centers = world.exported_from_run.apply(outcome.trajectory.centers[posed])
     found = georeference(centers, places[posed], outcome.metric)
     if isinstance(found, str):

@@ -88,7 +88,7 @@ def add_videos(run: RunFolder, videos: Sequence[Path], config: Config) -> Source
     numbers = [int(n) for p in earlier if (n := p.name.removeprefix(EXTENSION)).isdigit()]
     path = run.path(f"{EXTENSION}{max(numbers, default=0) + 1}", SOURCE_LIST)
     trajectory = run.load(TRAJECTORY, _FINAL)
-    placed = np.flatnonzero(trajectory.is_placed)
+    placed = np.flatnonzero(trajectory.is_posed)
     write_tum(path.with_name(_POSES), trajectory.timestamps[placed], trajectory.world_from_cam[placed])
     write_text(path, "".join(f"{file}\n" for file in [*files, *(v.resolve() for v in videos)]))
     source = Source(str(path.resolve()), open_recording(path, config.run.format).digest)

@@ -105,17 +105,16 @@ def adjust_state(
     return Report(figures, frame_ids, ties, with_depths(bundle, ties, intrinsics, use_depth))
 
 
-def drop_loose(
-    state: TrackState, report: Report, intrinsics: Intrinsics, least: int
-) -> tuple[list[int], list[list[int]]]:
-    """Lose, in place, the frames whose poses neither images nor metric depths determine against the rest of their
-    segment (`undetermined_cameras`), in groups of fewer than `least` keyframes; return them and the groups that stay.
+def part_loose(state: TrackState, report: Report, intrinsics: Intrinsics, least: int) -> None:
+    """Part, in place, what neither images nor metric depths determine against the rest of its segment
+    (`undetermined_cameras`): groups of at least `least` keyframes become segments of their own, for nobody knows their
+    scale beside the rest; the frames of smaller ones are lost.
 
     Frames that were not adjusted themselves go with the keyframes beside them. One or two between others stay.
     """
     ids = report.frame_ids
     if len(state.rig) > 1:  # a panorama sees all around
-        return [], []
+        return
     segments: dict[int, list[int]] = {}
     for k in np.unique(report.bundle.obs_cam).tolist():
         segments.setdefault(state.segment[ids[k]], []).append(k)
@@ -131,7 +130,10 @@ def drop_loose(
     for i in sorted(loose):
         state.remove_frame(i)
         state.lost[i] = "what it shows does not determine its pose relative to the rest"
-    return sorted(loose), [[ids[k] for k in group] for group in apart]
+    for group in apart:
+        inside = {ids[k] for k in group}
+        beside = {i for i in others if i in state.poses and state.nearest_keyframes(i, 1)[0] in inside}
+        state.detach(inside | beside)
 
 
 def undo_rolling_shutter(

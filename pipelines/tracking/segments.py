@@ -1,7 +1,6 @@
 """Joining stretches that began anew after a loss, when a keyframe of one is recognised in another."""
 
 from collections import Counter, deque
-from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -148,19 +147,9 @@ def move_segment(segment: int, main: int, main_from_segment: Similarity, state: 
         state.segment[i] = main
 
 
-def carry_given(context: StageContext, state: TrackState, apart: Iterable[Sequence[int]]) -> dict[str, Any]:
-    """Join the state's segments by the given poses, and pose lost frames by them, in place; figures of it. Groups of
-    frames that lie `apart` from the rest of their segments are segments of their own where most have a given pose."""
+def carry_given(context: StageContext, state: TrackState) -> dict[str, Any]:
+    """Join the state's segments by the given poses, and pose lost frames by them, in place; figures of it."""
     given = context.run.find(GIVEN_POSES)
-    for group in apart:
-        if given is not None and 2 * given.known[list(group)].sum() > len(group):
-            _detach(state, group)
-            continue
-        context.warn(
-            f"{len(group)} frames ({stretches(group)}) are consistent with each other, but almost nothing connects "
-            "them to the rest: their relative position and scale are unreliable. Film the transition again, with more "
-            "than a bare wall in view"
-        )
     if given is None:
         return {}
     drop_inconsistent_segments(state, given)
@@ -176,14 +165,6 @@ def carry_given(context: StageContext, state: TrackState, apart: Iterable[Sequen
             f"{len(carried)} frames ({stretches(carried)}) are posed by --poses alone: the images say nothing of them"
         )
     return {"given_joined": joined, "given_carried": len(carried)}
-
-
-def _detach(state: TrackState, group: Sequence[int]) -> None:
-    """Make frames a segment of their own, in place, which shares no point with another."""
-    elsewhere = np.concatenate([seen.point for i, seen in state.sightings.items() if i not in set(group)])
-    state.segment |= dict.fromkeys(group, max(state.segment.values()) + 1)
-    for i in group:
-        state.sightings[i] = state.sightings[i].select(~np.isin(state.sightings[i].point, elsewhere))
 
 
 def drop_inconsistent_segments(state: TrackState, given: GivenPoses) -> None:

@@ -26,8 +26,8 @@ from ..system.progress import is_asked
 from ..system.values import load_value, save_value
 from ..system.wording import stretches
 from ..types import Frame
-from .adjust import Report, adjust_state, align_depths, drop_loose, has_independent_depth
-from .front_end import FrontEnd, set_rotation_only_poses
+from .adjust import Report, adjust_state, align_depths, has_independent_depth, part_loose
+from .front_end import FrontEnd
 from .pnp import MAX_GAP
 from .segments import carry_given, join_segments, split_segments
 from .state import (
@@ -64,18 +64,16 @@ class TrackingStage:
 
     def run(self) -> dict[str, Any]:
         """Do the stage; its key figures."""
-        pictures, seed = self.pictures, self.config.run.seed
+        pictures = self.pictures
         state = self._track_frames()
         self._require_poses(state, 2 if self.context.run.find(GIVEN_POSES) is None else 1)
         report = adjust_state(
             state, pictures.intrinsics, pictures.proxy, self.is_metric, has_independent_depth(self.proxy)
         )
         release_free_memory()
-        _, apart = drop_loose(state, report, pictures.intrinsics, LEAST_PIECE)
-        carried = carry_given(self.context, state, apart)
+        part_loose(state, report, pictures.intrinsics, LEAST_PIECE)
+        carried = carry_given(self.context, state)
         self._require_poses(state, 2)
-        set_rotation_only_poses(state, pictures, seed)
-        self._warn_of_turned(state)
         state, *pieces = split_worlds(state, LEAST_PIECE)
         self._save_pieces(pieces)
         self._save(state, report)
@@ -152,27 +150,18 @@ class TrackingStage:
             "frames": len(self.frames),
             "posed": len(state.poses),
             "keyframes": len(state.keyframes),
-            "by_rotation": len(state.turned),
             "lost": {str(i): reason for i, reason in sorted(state.lost.items())},
             "scale": "metric" if self.is_metric and world else "free",
             "scale_relative_sd": world.relative_sd if world else None,
             **report.figures,
         }
 
-    def _warn_of_turned(self, state: TrackState) -> None:
-        if state.turned:
-            self.context.warn(
-                f"{len(state.turned)} frames ({stretches(state.turned)}) are posed by rotation alone: their "
-                "orientation relative to neighbouring frames is known, their position is not"
-            )
-
     def _warn_of_lost(self, state: TrackState, pieces: list[TrackState]) -> None:
         lost = set(state.lost).difference(*(p.poses for p in pieces))
         if lost:
             self.context.warn(f"{len(lost)} frames have no pose: {stretches(lost)}")
         if len(state.rig) == 1:
-            unplaced = lost.union(state.turned, *(p.turned for p in pieces))
-            warn_of_stretches(self.context, self.frames, unplaced)
+            warn_of_stretches(self.context, self.frames, lost)
 
 
 def warn_of_stretches(context: StageContext, frames: list[Frame], unplaced: Collection[int]) -> None:

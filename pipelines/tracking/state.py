@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from itertools import chain
@@ -81,9 +81,8 @@ NO_SIGHTINGS = Sightings.of(np.zeros(0, np.int64), np.zeros((0, 2)), 1.0)
 class TrackState:
     """points (P, 3) in the world, colors (P, 3); per frame id its pose cam_from_world, its sightings or why it is lost.
 
-    `segment` numbers connected stretches: poses of different segments cannot be compared. `turned` are the
-    frames of which only the rotation is known; `done` counts the frames that have been visited; `rig` says which frames
-    were taken at one place, `shutter` how their rows were.
+    `segment` numbers connected stretches: poses of different segments cannot be compared. `done` counts the frames that
+    have been visited; `rig` says which frames were taken at one place, `shutter` how their rows were.
     """
 
     points: Array = field(default_factory=lambda: np.zeros((0, 3)))
@@ -95,7 +94,6 @@ class TrackState:
     segment: dict[int, int] = field(default_factory=dict)
     done: int = 0
     rig: Rig = ONE_CAMERA
-    turned: list[int] = field(default_factory=list)
     shutter: Shutter = field(default_factory=Shutter)
 
     @staticmethod
@@ -128,9 +126,8 @@ class TrackState:
         """Remove a posed frame; its points stay."""
         for table in (self.poses, self.sightings, self.segment):
             del table[frame_id]
-        for listed in (self.keyframes, self.turned):
-            if frame_id in listed:
-                listed.remove(frame_id)
+        if frame_id in self.keyframes:
+            self.keyframes.remove(frame_id)
 
     def add_segment(self, other: TrackState) -> None:
         """Add the keyframes of another world that are not posed yet, with their points, as a segment of their own."""
@@ -139,6 +136,14 @@ class TrackState:
         for k in (k for k in other.keyframes if k not in self.poses):
             seen = other.sightings[k]
             self.add_frame(k, other.poses[k], replace(seen, point=seen.point + first), True, segment)
+
+    def detach(self, frame_ids: Collection[int]) -> None:
+        """Make frames a segment of their own, which shares no point with another."""
+        elsewhere = np.concatenate([seen.point for i, seen in self.sightings.items() if i not in frame_ids])
+        segment = max(self.segment.values()) + 1
+        for i in frame_ids:
+            self.segment[i] = segment
+            self.sightings[i] = self.sightings[i].select(~np.isin(self.sightings[i].point, elsewhere))
 
     def add_points(self, points: Array, colors: NDArray[np.uint8]) -> NDArray[np.int64]:
         """Add points and return their indices (Q,)."""
@@ -233,7 +238,6 @@ def _in_own_world(state: TrackState, segment: int) -> TrackState:
         [k for k in state.keyframes if state.segment[k] == segment],
         segment=dict.fromkeys(inside, segment),
         rig=state.rig,
-        turned=[i for i in state.turned if state.segment[i] == segment],
         shutter=state.shutter,
     )
 
@@ -247,7 +251,6 @@ def to_trajectory(state: TrackState, frames: list[Frame]) -> Trajectory:
         cam_from_world=np.array([state.poses.get(f.id, np.eye(4)) for f in frames]),
         is_keyframe=np.array([f.id in keyframes for f in frames]),
         lost_reasons=tuple("" if f.id in state.poses else state.lost.get(f.id, "not tracked") for f in frames),
-        by_rotation=np.isin([f.id for f in frames], state.turned),
     )
 
 
@@ -267,9 +270,9 @@ def sparse_model_of(state: TrackState) -> SparseModel:
 
 
 def to_frame_observations(state: TrackState) -> FrameObservations:
-    """Return where the placed frames that are no keyframes see the points of `sparse_model_of`."""
+    """Return where the posed frames that are no keyframes see the points of `sparse_model_of`."""
     used = np.unique(state.shared_sightings(state.keyframes)[1].point)
-    frames = sorted(set(state.poses).difference(state.keyframes, state.turned))
+    frames = sorted(set(state.poses).difference(state.keyframes))
     seen = [state.sightings[i] for i in frames]
     frame_id = np.repeat(np.array(frames, np.int64), [len(s) for s in seen])
     point = np.concatenate([np.zeros(0, np.int64), *(s.point for s in seen)])

@@ -58,7 +58,7 @@ def beside_views(outcome: Outcome, truth: Path) -> list[tuple[Picture, NDArray[n
     """Image (h, w, 3), the pixels that the path saw, and cam_from_world (4, 4) in the run's world of each view."""
     t = outcome.trajectory
     matched = match_by_time(t.timestamps, open_sequence(truth))
-    known = np.flatnonzero(t.is_placed & matched.has_pose)
+    known = np.flatnonzero(t.is_posed & matched.has_pose)
     scale = absolute_error(t.centers[known], matched.world_from_cam[known, :3, 3], with_scale=True).alignment.scale
     poses = np.loadtxt(truth / "beside" / "poses.txt").reshape(-1, 4, 4)
     views = []
@@ -87,7 +87,7 @@ def on_path(outcome: Outcome) -> dict[str, float]:
     """Mean PSNR at keyframes and at frames between them."""
     t = outcome.trajectory
     found = {}
-    for name, rows in (("keyframes", t.is_keyframe), ("between", t.is_placed & ~t.is_keyframe)):
+    for name, rows in (("keyframes", t.is_keyframe), ("between", t.is_posed & ~t.is_keyframe)):
         values = []
         for row in spread_sample(np.flatnonzero(rows).tolist(), ON_PATH):
             drawn = render_outcome(outcome, t.cam_from_world[row]).exposed(outcome.exposure, t.timestamps[row])

@@ -209,7 +209,7 @@ def measure_colmap(name: str, form: str, work: Path, mapper: str) -> dict[str, A
     row |= {"reprojection": round(model.compute_mean_reprojection_error(), 3), "focal": camera.mean_focal_length()}
     if (focal := true_focal(name, (camera.width, camera.height))) is not None:
         row["focal_off"] = round(100 * (row["focal"] / focal - 1), 2)
-    return row | compare(poses[placed], [t for t, is_placed in zip(truth, placed, strict=True) if is_placed])
+    return row | compare(poses[placed], [t for t, known in zip(truth, placed, strict=True) if known])
 
 
 def _poses(run: Any, until: str) -> tuple[list[int], Array]:
@@ -218,7 +218,7 @@ def _poses(run: Any, until: str) -> tuple[list[int], Array]:
         backbone = run.find(BACKBONE)
         return [int(i) for i in backbone.frame_ids], backbone.cam_from_world
     trajectory = run.load(TRAJECTORY, until)
-    return np.flatnonzero(trajectory.is_placed).tolist(), trajectory.cam_from_world[trajectory.is_placed]
+    return np.flatnonzero(trajectory.is_posed).tolist(), trajectory.cam_from_world[trajectory.is_posed]
 
 
 def compare(cam_from_world: Array, truth: list[Array | None]) -> dict[str, float]:

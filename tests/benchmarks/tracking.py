@@ -234,8 +234,8 @@ def measure_ours(name: str, work: Path, settings: Sequence[str], until: str) -> 
     truth = [case.truth(n, f.source_index) for n, f in zip(originals, frames, strict=True)]
     metric = bool(run.load(FIGURES["proxy"]).get("metric", False))
     return {
-        **errors(trajectory.cam_from_world, trajectory.is_placed, truth, metric),
-        "pieces": {name: errors(t.cam_from_world, t.is_placed, truth, False) for name, t in pieces.items()},
+        **errors(trajectory.cam_from_world, trajectory.is_posed, truth, metric),
+        "pieces": {name: errors(t.cam_from_world, t.is_posed, truth, False) for name, t in pieces.items()},
         "cpu_seconds": {stage: round(spent["cpu"], 1) for stage, spent in seconds.items()},
         "clock_seconds": {stage: round(spent["clock"], 1) for stage, spent in seconds.items()},
         "adjustment_cpu_seconds": round(sum(adjusting), 1),

@@ -37,13 +37,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Judged:
-    """Shares of the picked frames in the result, in its pieces and by rotation alone; of the result: ATE in metres and
+    """Shares of the picked frames in the result and in its pieces; of the result: ATE in metres and
     over the path, scale of thirds and stretches, and the share of its frames that is somewhere else."""
 
     picked: int
     placed: float
     in_pieces: float
-    by_rotation: float
     ate: float
     of_path: float
     thirds: float
@@ -55,7 +54,7 @@ class Judged:
     @property
     def passes(self) -> tuple[bool, bool, bool]:
         """All placed, ATE, scale."""
-        return self.placed + self.by_rotation > 0.999, self.of_path <= ATE, abs(np.log(self.thirds)) <= np.log1p(THIRDS)
+        return self.placed > 0.999, self.of_path <= ATE, abs(np.log(self.thirds)) <= np.log1p(THIRDS)
 
 
 def judge(run: Path, truth: Path) -> Judged:
@@ -68,20 +67,19 @@ def judge(run: Path, truth: Path) -> Judged:
     matched = match_by_time(outcome.trajectory.timestamps, sequence)
     true = matched.world_from_cam[:, :3, 3]
     whole = outcome.trajectory
-    placed = whole.is_placed & matched.has_pose
+    placed = whole.is_posed & matched.has_pose
     ours, theirs = whole.centers[placed], true[placed]
     error = absolute_error(ours, theirs, with_scale=True)
     pieces: list[tuple[int, float]] = []
     for name in folder.pieces("tracking"):
         piece: Trajectory = folder.load(TRAJECTORY, "tracking", piece=name)
-        theirs_of = match_by_time(piece.timestamps, sequence).world_from_cam[piece.is_placed][:, :3, 3]
-        apart = absolute_error(piece.centers[piece.is_placed], theirs_of, with_scale=True)
-        pieces.append((int(piece.is_placed.sum()), apart.statistics.rmse))
+        theirs_of = match_by_time(piece.timestamps, sequence).world_from_cam[piece.is_posed][:, :3, 3]
+        apart = absolute_error(piece.centers[piece.is_posed], theirs_of, with_scale=True)
+        pieces.append((int(piece.is_posed.sum()), apart.statistics.rmse))
     return Judged(
         picked=len(placed),
-        placed=float(whole.is_placed.mean()),
+        placed=float(whole.is_posed.mean()),
         in_pieces=sum(n for n, _ in pieces) / len(placed),
-        by_rotation=float(whole.by_rotation.mean()),
         ate=error.statistics.rmse,
         of_path=error.statistics.rmse / length,
         thirds=_thirds(ours, theirs),
@@ -119,7 +117,7 @@ def main() -> None:
         found.append(one.passes)
         parts = ", ".join(f"{n} frames {100 * e:.1f} cm" for n, e in one.pieces) or "none"
         print(
-            f"{Path(run).stem}: {one.picked} picked, placed {one.placed:.1%} (by rotation {one.by_rotation:.1%}, in "
+            f"{Path(run).stem}: {one.picked} picked, placed {one.placed:.1%} (in "
             f"pieces {one.in_pieces:.1%}); ATE {100 * one.ate:.1f} cm, {one.of_path:.2%}; thirds {one.thirds:.3f}, "
             f"stretch {one.stretch:.2f}; misplaced {one.misplaced:.0%}; pieces: {parts}",
             flush=True,

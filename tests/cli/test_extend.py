@@ -69,7 +69,7 @@ def copied(videos: Videos, tmp_path: Path) -> Callable[[str], Path]:
 
 def centers_of(run: Path) -> np.ndarray:
     trajectory = RunFolder(run).load(TRAJECTORY, "global_ba")
-    assert trajectory.is_placed.all()
+    assert trajectory.is_posed.all()
     return inverse(trajectory.cam_from_world)[:, :3, 3]
 
 

@@ -14,7 +14,7 @@ from msgs_slam.pipelines.sfm.adjust import FEATURE_SD
 from msgs_slam.pipelines.sfm.bundle import Bundle, Problem, adjust_bundle, adjust_pose, solve_blocks
 from msgs_slam.pipelines.sfm.given import posed_model
 from msgs_slam.pipelines.tracking import adjust
-from msgs_slam.pipelines.tracking.adjust import adjust_state, consistent, drop_loose
+from msgs_slam.pipelines.tracking.adjust import adjust_state, consistent, part_loose
 from msgs_slam.pipelines.tracking.pnp import colmap_camera
 from msgs_slam.pipelines.tracking.state import Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
@@ -259,7 +259,7 @@ def test_frames_whose_poses_nothing_determines_are_lost() -> None:
         state.sightings[i] = state.sightings[i].select(np.arange(3))
     report = adjust_state(state, intrinsics, lambda _: None, False, True)
     before = dict(state.poses)
-    assert drop_loose(state, report, intrinsics, least=8) == ([*range(12), 33], [])
+    part_loose(state, report, intrinsics, least=8)
     assert sorted(state.poses) == state.keyframes == list(range(12, 33))
     assert sorted(state.lost) == [*range(12), 33]
     assert all("does not determine its pose" in why for why in state.lost.values())
@@ -271,17 +271,22 @@ def test_frames_that_follow_loose_keyframes_are_lost_with_them(monkeypatch: pyte
     state, intrinsics = walk_state(28, [*range(0, 12, 2), *range(12, 28)])
     report = adjust_state(state, intrinsics, lambda _: None, False, True)
     assert report.frame_ids == [*range(0, 12, 2), *range(12, 28)]
-    loose, _ = drop_loose(state, report, intrinsics, least=8)
-    assert loose == list(range(11))  # the last one is followed from the room, too
+    part_loose(state, report, intrinsics, least=8)  # the last one is followed from the room, too
     assert sorted(state.poses) == list(range(11, 28))
 
 
 def test_exact_depths_determine_what_the_images_do_not() -> None:
-    """Without them a half that lies loosely beside the rest is told of, not lost."""
+    """Without them a half that lies loosely beside the rest is a world of its own."""
     state, intrinsics = walk_state(20, range(20))
     report = adjust_state(state, intrinsics, lambda _: None, False, True)
-    assert drop_loose(state, report, intrinsics, least=8) == ([], [list(range(12))])
     z = report.bundle.points_in_cam()[:, 2]
     tied = replace(report, bundle=replace(report.bundle, obs_depth=z, obs_depth_sd=np.full(len(z), 1e-6)))
-    assert drop_loose(state, tied, intrinsics, least=8) == ([], [])
+    part_loose(state, tied, intrinsics, least=8)
     assert sorted(state.poses) == list(range(20))
+    assert set(state.segment.values()) == {0}
+    part_loose(state, report, intrinsics, least=8)
+    assert sorted(state.poses) == list(range(20))
+    assert [i for i, segment in state.segment.items() if segment] == list(range(12))
+    theirs, ours = (np.concatenate([state.sightings[i].point for i in r]) for r in (range(12), range(12, 20)))
+    assert len(theirs) > 0
+    assert not np.isin(theirs, ours).any()

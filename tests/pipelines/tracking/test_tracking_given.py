@@ -60,7 +60,7 @@ def test_a_blank_stretch_is_carried_and_the_rest_is_metric(tmp_path: Path) -> No
     run = RunFolder(tmp_path / "run")
     records = reconstruct(tmp_path / "pictures", run, config, SilentProgress(), "tracking")
     trajectory = run.load(TRAJECTORY, "tracking")
-    assert trajectory.is_placed.all()
+    assert trajectory.is_posed.all()
     told = " ".join(w for r in records.values() for w in r.warnings)
     assert "posed by --poses alone" in told
     assert records["frames"].figures["given_wrong"] == [3]
@@ -176,12 +176,14 @@ def test_a_group_that_lies_loosely_beside_the_rest_is_put_where_the_given_poses_
     for i in group:
         state.poses[i] = bent.apply_to_poses(true[i][None])[0]
         state.sightings[i] = Sightings.of(np.arange(2), np.zeros((2, 2)), 1.0)  # the first is seen by all
-    given = GivenPoses(true if is_given else np.full_like(true, np.nan), True, "made up")
+    given = GivenPoses(true, True, "made up") if is_given else None
     warned: list[str] = []
     context: Any = SimpleNamespace(run=SimpleNamespace(find=lambda _: given), warn=warned.append)
-    figures = carry_given(context, state, [group])
-    assert figures["given_joined"] == is_given
-    assert ("disconnected components" if is_given else "10 frames (10-19) are consistent") in warned[0]
+    state.detach(group)
+    figures = carry_given(context, state)
+    assert figures.get("given_joined") == (1 if is_given else None)
+    assert ["disconnected components" in w for w in warned] == [True] * is_given
+    assert len({state.segment[0], state.segment[group[0]]}) == 2 - is_given
     off = np.abs([state.poses[i] - true[i] for i in range(40)]).max((1, 2))
     assert off[:10].max() == off[20:].max() == 0
     assert (off[group].max() < 1e-9) == is_given

@@ -1,4 +1,4 @@
-"""A camera that turns on the spot keeps its rotation; one that walks, or shows another place, is not taken for one."""
+"""A camera that turns away from all that has depth has no pose; long stretches without one are told."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,16 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from msgs_slam.pipelines.config import Config
-from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.run.files import TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.stages import StageContext
-from msgs_slam.pipelines.tracking.front_end import fit_rotation, turn_between
 from msgs_slam.pipelines.tracking.stage import run as run_tracking
 from msgs_slam.pipelines.tracking.stage import warn_of_stretches
-from msgs_slam.pipelines.tracking.state import Pictures
-from msgs_slam.pipelines.types import Frame, Intrinsics, Trajectory
+from msgs_slam.pipelines.types import Frame, Intrinsics
 from tests.pipelines.tracking.conftest import MadeRun
 from tests.world.clip import ClipOptions, WorldFrame, develop, make_world, render_view
 
@@ -42,19 +38,12 @@ def turned_by(world_from_cam: np.ndarray, degrees: float) -> np.ndarray:
     return out
 
 
-def moved_by(world_from_cam: np.ndarray, metres: float) -> np.ndarray:
-    """The camera moved sideways."""
-    out = world_from_cam.copy()
-    out[:3, 3] += metres * out[:3, 0]
-    return out
-
-
 @pytest.fixture(scope="module")
 def last_pose(room_frames: tuple[Intrinsics, list[WorldFrame]]) -> np.ndarray:
     return room_frames[1][LAST].world_from_cam
 
 
-def test_a_turn_away_keeps_its_frames_and_says_so(
+def test_a_turn_away_is_lost_and_said(
     tmp_path: Path, make_run: Callable[..., MadeRun], open_stage: Callable[..., StageContext], last_pose: np.ndarray
 ) -> None:
     angles = np.arange(12, 97, 12)
@@ -64,56 +53,13 @@ def test_a_turn_away_keeps_its_frames_and_says_so(
     context.folder.rename(made.run.stage("tracking"))
 
     found = made.run.load(TRAJECTORY, "tracking")
-    turned = np.flatnonzero(found.by_rotation)
-    assert found.is_posed.all()
+    turned = np.flatnonzero(~found.is_posed)
     assert turned.min() > LAST, "frames of the walk are placed by what they see"
     assert len(turned) >= 4, "the turn leads away from all that has depth"
-    assert (figures["by_rotation"], figures["posed"]) == (len(turned), LAST + 1 + len(angles))
-    assert not (found.is_placed & found.by_rotation).any()
-    anchor = int(turned.min()) - 1
-    assert np.allclose(found.centers[turned], found.centers[anchor], atol=1e-9)
-    truth = made.cam_from_world
-    for i in turned.tolist():
-        wanted, got = (p[i] @ se3.inverse(p[anchor]) for p in (truth, found.cam_from_world))
-        assert 0 < se3.rotation_angle(got @ se3.inverse(wanted)) < np.radians(1.5)
-    assert any("rotation alone" in w and f"{turned[0]}-{turned[-1]}" in w for w in context.warnings)
-
-
-def test_a_walk_is_no_turn_nor_is_another_place(
-    tmp_path: Path, make_run: Callable[..., MadeRun], last_pose: np.ndarray
-) -> None:
-    beside, behind = moved_by(last_pose, 0.5), turned_by(last_pose, 150)
-    more = seen_from([turned_by(last_pose, 12), beside, turned_by(beside, 12), behind])
-    run = make_run(tmp_path / "run", more=more).run
-    pictures = Pictures(run, Config().frames)
-    turn, beside_id, turned_too, behind_id = range(LAST + 1, LAST + 5)
-    found = turn_between(LAST, turn, pictures, 0)
-    assert found is not None
-    truth = se3.inverse(turned_by(last_pose, 12)) @ last_pose
-    assert 0 < se3.rotation_angle(found @ se3.inverse(truth)) < np.radians(0.5)
-    assert np.array_equal(found, turn_between(LAST, turn, pictures, 0))
-    for other in (beside_id, turned_too, behind_id):
-        assert turn_between(LAST, other, pictures, 0) is None
-
-
-def test_a_rotation_is_found_among_wrong_matches() -> None:
-    rng = np.random.default_rng(0)
-    camera = Intrinsics(640, 480, 500, 500, 320, 240)
-    truth = Rotation.from_rotvec([0.05, -0.2, 0.1]).as_matrix()
-    xy = rng.uniform(0, 1, (100, 2)) * [640, 480]
-    rays = np.column_stack([(xy - [320, 240]) / 500, np.ones(100)]) @ truth.T
-    there = rays[:, :2] / rays[:, 2:] * 500 + [320, 240] + rng.normal(size=(100, 2))
-    there[60:] = rng.uniform(0, 1, (40, 2)) * [640, 480]
-    rotation, agree = fit_rotation(xy, there, camera, rng)
-    assert agree[:60].all()
-    assert agree[60:].sum() < 3
-    assert 0 < Rotation.from_matrix(rotation @ truth.T).magnitude() < np.radians(0.1)
-
-
-def test_of_trajectories_of_retired_settings_every_pose_has_its_place() -> None:
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    old = Trajectory(np.arange(3), np.arange(3.0), poses, np.array([True, False, False]), ("", "", "lost"))
-    assert old.is_placed.tolist() == [True, True, False]
+    assert figures["posed"] == found.is_posed.sum()
+    assert {int(i) for i in figures["lost"]} == {*turned.tolist()}
+    assert any(f"{len(turned)} frames have no pose" in w for w in context.warnings)
+    assert all(found.lost_reasons[i] for i in turned)
 
 
 @pytest.mark.parametrize(
