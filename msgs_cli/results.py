@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 KEY_FIGURES = {
     "frames": ("frames", "keyframes_placed", "calibration", "focal_px", "focal_sd_px", "still_left_out", "gps"),
     "proxy": ("depth", "semantics", "metric", "metres_per_unit", "classes"),
-    "tracking": ("posed", "keyframes", "lost", "scale"),
+    "tracking": ("posed", "keyframes", "lost", "links", "scale"),
     "mapping": ("gaussians", "keyframe_psnr"),
-    "global_ba": ("loops", "images_posed", "keyframe_psnr"),
+    "global_ba": ("images_posed", "keyframe_psnr"),
     "export": ("images", "vertices", "faces", "up", "floor", "gps"),
 }
 """What a person wants to know first; `status -v` says all."""

@@ -214,7 +214,7 @@ class MappingConfig:
 
 @dataclass(frozen=True)
 class GlobalBaConfig:
-    """Loops and the global adjustment."""
+    """Poses of the images between the picked frames."""
 
     posed: str = setting(
         "every", "every: all images of a video get a pose, those between the picked frames (frames.rate a second) too; "

@@ -57,7 +57,7 @@ def write_report(
 def _report(outcome: Outcome, target: Path, progress: Progress) -> str:
     """The HTML of the report that will be at `target`."""
     run = outcome.run
-    sparse, loops = outcome.load_sparse(), run.load(LOOPS) if "global_ba" in outcome.records else []
+    sparse, loops = outcome.load_sparse(), run.load(LOOPS, "global_ba") if "global_ba" in outcome.records else []
     evaluation = read_json(run.evaluation_file) if run.evaluation_file.exists() else None
     body = "".join(
         [

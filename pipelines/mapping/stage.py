@@ -4,7 +4,7 @@ At any time no more than one submap is in work. A recording of the usual length 
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from ...formats.errors import InputError
 from ..depth.fields import DepthFields
 from ..geometry.posed_depth import PosedDepth, overlaps
 from ..render.gaussian_map import GaussianMap
-from ..run.files import CALIBRATION, CLASS_IDS, DEPTH_FIELDS, EXPOSURE, FIGURES, MAP, SUBMAPS, TRAJECTORY
+from ..run.files import CALIBRATION, DEPTH_FIELDS, EXPOSURE, FIGURES, MAP, TRAJECTORY
 from ..run.stages import StageContext
 from ..system.machine import submap_count, submap_size
 from ..types import Trajectory
@@ -28,11 +28,9 @@ from .submap_tasks import (
     MADE,
     REFINED,
     STEPS,
-    SubmapResult,
     SubmapTask,
     measure_submap,
     merge_results,
-    select_own,
 )
 from .submaps import Submap, divide
 from .views import survey, with_rigid_panoramas
@@ -138,7 +136,6 @@ class SubmapWork:
         trajectory: Trajectory,
         fields: DepthFields,
         class_ids: tuple[int, ...],
-        passes: float | None = None,
     ) -> None:
         self.context, self.trajectory, self.fields = context, trajectory, fields
         # Parts of another size, as of a run that goes on with other memory, are others.
@@ -146,7 +143,7 @@ class SubmapWork:
         self.tasks = [
             SubmapTask(
                 context.run, context.config, files, number, submap, trajectory.of_frames(submap.views),
-                _only(fields, submap.views), class_ids, camera, passes=passes,
+                _only(fields, submap.views), class_ids, camera,
             )
             for number, submap in enumerate(submaps)
         ]  # fmt: skip
@@ -157,13 +154,9 @@ class SubmapWork:
         kinds = kinds if len(self.tasks) > 1 else kinds[:1]
         for kind in kinds:
             self.context.each(STEPS[kind], self.tasks)
-        self.look_at(kinds[-1])
-
-    def look_at(self, kind: str) -> None:
-        """Take what there is of this kind beside the maps, of which one at a time is in memory."""
-        self.kind, self._counts, results = kind, [], []
-        for task in self.tasks:
-            result = task.load(kind, task.number)
+        self.kind, self._counts, results = kinds[-1], [], []
+        for task in self.tasks:  # one map at a time is in memory
+            result = task.load(self.kind, task.number)
             results.append(result.without_map)
             self._counts.append(len(result.gaussian_map))
         self.ids, self.cam_from_world, self.exposure = merge_results(results)
@@ -203,47 +196,7 @@ class SubmapWork:
         keyframes = [figures for own, _ in found for figures in own]
         return [keyframes[r] for r in ranked], [figures for _, others in found for figures in others]
 
-    def keyframe_psnr(self) -> float:
-        """Mean over the keyframes, in dB."""
-        return float(np.nanmean([figures.psnr for figures in self.measure()[0]]))
-
 
 def _only(fields: DepthFields, frame_ids: NDArray[np.int64]) -> DepthFields:
     wanted = {i: field for i in frame_ids.tolist() if (field := fields.of_frame.get(i)) is not None}
     return DepthFields(wanted) if wanted else fields  # one without any field means another thing
-
-
-@dataclass(frozen=True)
-class Refined:
-    """A refined map, its keyframes' poses and exposures, and their mean PSNR before and after."""
-
-    result: OptimisedMap
-    psnr_before: float
-    psnr_after: float
-
-    @property
-    def is_better(self) -> bool:
-        """Whether PSNR did not drop; otherwise the refinement is discarded."""
-        return self.psnr_after >= self.psnr_before
-
-
-def refine_map(
-    context: StageContext, gaussian_map: GaussianMap, trajectory: Trajectory, fields: DepthFields, passes: float
-) -> Refined:
-    """A map that is there, and the poses of its keyframes, refined together: every view visited `passes` times."""
-    exposure = context.run.load(EXPOSURE)
-    ids, log_gains, offsets = exposure["frame_ids"], exposure["log_gains"], exposure["offsets"]
-    stored = [Submap(s["own"], s["border"], tuple(s["beside"].tolist())) for s in context.run.load(SUBMAPS)]
-    submaps, anchors = stored or [Submap.whole(ids)], gaussian_map.anchor_frame_ids.cpu().numpy()
-    work = SubmapWork(context, submaps, trajectory, fields, context.run.load(CLASS_IDS), passes)
-    for task in work.tasks:
-        rows = np.isin(ids, task.submap.own)
-        poses = trajectory.of_frames(task.submap.own).cam_from_world
-        own = select_own(gaussian_map, anchors, task.submap) if stored else gaussian_map
-        nothing = np.zeros((0, 1, 1), np.float32), np.zeros(1, np.int64)
-        task.save(JOINED, SubmapResult(own, ids[rows], poses, log_gains[rows], offsets[rows], *nothing))
-    work.look_at(JOINED)
-    before = work.keyframe_psnr()
-    work.bring_to(REFINED, AGREED)
-    after = work.keyframe_psnr()
-    return Refined(work.whole(), before, after)

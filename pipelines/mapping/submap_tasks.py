@@ -48,7 +48,7 @@ _DEPTH_SIDE = 160
 class SubmapTask:
     """What it takes to work on submap `number`: `trajectory` holds its views (to measure it: its own keyframes, and
     what is held out), `exposure` theirs, `fields` brings their depths into the world, `files` is the folder of all
-    submaps' results; `passes` of the refinement where they are not a share of making's; `measured`: kind of result."""
+    submaps' results; `measured`: kind of result."""
 
     run: RunFolder
     config: Config
@@ -60,7 +60,6 @@ class SubmapTask:
     class_ids: tuple[int, ...]
     camera: Intrinsics
     exposure: Exposures | None = None
-    passes: float | None = None
     measured: str = AGREED
 
     @property
@@ -239,8 +238,8 @@ def _optimise(
 ) -> OptimisedMap:  # fmt: skip
     """From a snapshot where there is one, which goes when the result is written."""
     settings, seed = replace(task.config.mapping, hold_out=0), task.config.run.seed
-    visits = REFINING_SHARE * settings.passes if task.passes is None else task.passes
-    passes, rate = (None, 1.0) if initial is None else (visits, REFINING_RATE if task.submap.neighbours else 1.0)
+    visits, rate = REFINING_SHARE * settings.passes, REFINING_RATE if task.submap.neighbours else 1.0
+    passes, rate = (None, 1.0) if initial is None else (visits, rate)
     of = f" submap {task.number + 1}" if task.submap.neighbours else ""
     return optimise_map(
         given.views, len(task.class_ids), settings, seed, initial, passes,

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from ..depth.fields import FINE
 from ..geometry import se3
 from ..geometry.camera import project
-from ..global_ba.close import Edges, optimise_pose_graph
 from ..mapping.views import View, half_view
 from ..proxy.maps import mean_iou
+from ..tracking.graph import Edges, optimise_pose_graph
 from ..types import VOID, Intrinsics, LoopEdge
 from .rendering import Gaussians
 from .rerender import Rerendering, Samples, sample

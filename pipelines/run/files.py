@@ -295,7 +295,7 @@ def _loops(rows: Any) -> list[LoopEdge]:
 
 
 LOOPS: RunFile[list[LoopEdge]] = RunFile(
-    "loops.json", ("global_ba",), "table of loops", _loops,
+    "loops.json", ("tracking", "global_ba"), "table of loops", _loops,
     lambda loops: [{**vars(e), "frame2_from_frame1": e.frame2_from_frame1.tolist()} for e in loops],
 )  # fmt: skip
 """The verified loops of the global adjustment."""

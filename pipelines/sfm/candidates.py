@@ -31,7 +31,7 @@ from .consistency import (
     unexplained,
 )
 from .given import posed_model
-from .joining import WIDE, merge_loop_points, repair_scale_breaks
+from .joining import WIDE, merge_loop_points
 from .lens import FOCAL_GUESS, unknown_camera
 from .matching import VerifiedPair, write_database
 from .rolling import NO_READOUT, Readout, adjust_rolling, read_readout, straight_copy
@@ -245,12 +245,7 @@ class CandidateModels:
     def _judged(
         self, name: str, model: pycolmap.Reconstruction, views: KeyframeSet, every: Sequence[VerifiedPair]
     ) -> _ScoredModel:
-        """The model, repaired, and how good it is."""
-        seen = every, views.xy, self._places(views.xy), self.config.overlap
-        report = judge(model, *seen)
-        if views.weak:
-            model, report = repair_scale_breaks(model, report, *seen, self.seed)
-        return model, name, report
+        return model, name, judge(model, every, views.xy, self._places(views.xy), self.config.overlap)
 
     def _run_mapper(
         self,

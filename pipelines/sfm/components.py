@@ -164,12 +164,6 @@ def find_components(
     return sorted(components.values(), key=lambda p: (-len(p), p[0]))
 
 
-def components_of(model: pycolmap.Reconstruction, total: int, reach: int) -> list[list[int]]:
-    """Divide the placed keyframes of a model by `find_components`; image i + 1 is keyframe i, at place i % total."""
-    placed, tracks = sorted({(i - 1) % total for i in model.reg_image_ids()}), tracks_of(model, total)
-    return find_components(placed, find_seams(placed, (), tracks, reach), tracks, reach)
-
-
 def tracks_of(model: pycolmap.Reconstruction, total: int) -> list[list[int]]:
     """For every point the places it is seen from, sorted; image i + 1 is keyframe i, at place i % total."""
     return [sorted({(e.image_id - 1) % total for e in p.track.elements}) for p in model.points3D.values()]

@@ -1,15 +1,11 @@
-"""Parts of a path become one: windows of a long recording, the ends of a loop, and structures of two sizes.
+"""Parts of a path become one: windows of a long recording, and the ends of a loop.
 
 A mapper's memory grows by half a megabyte to two a keyframe, nearly all of it in its adjustments, so that no more than
 one window is in work at any time. What is joined is adjusted by `pipelines.sfm.bundle`, which needs a tenth.
-
-Two structures that share one keyframe may be of any size beside each other. A mapper that has given one of them a wrong
-size throws away what contradicts it, the features matched on both sides, though their depths in the shared keyframe,
-once from the cameras before and once from those behind it, give the scale of one side against the other.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,11 +15,10 @@ from numpy.typing import NDArray
 from ...formats.colmap import pose_of, set_pose
 from ..geometry import se3
 from ..geometry.se3 import Similarity, best_rotation
-from .adjust import LOSS_SD, bundle_adjust, filter_outliers, median_error
+from .adjust import LOSS_SD, filter_outliers, median_error
 from .bundle import adjust_bundle
-from .components import MIN_POINTS, components_of, remove_keyframes, tracks_of
-from .consistency import ModelReport, judge, unit_rays
-from .given import bare_model, complete_tracks
+from .components import remove_keyframes
+from .given import bare_model
 from .matching import VerifiedPair
 from .rolling import MIN_GAIN, NO_READOUT, Readout, RollingModel, estimate
 
@@ -252,98 +247,3 @@ class WindowModels:
                 placed |= component.poses.keys()
                 found.append(model)
         return found
-
-
-# scale breaks ----------------------------------------------------------------------------------------------------
-
-_MIN_ANGLE = 0.01
-"""Radians between the rays of two cameras below which they give no depth."""
-
-
-def repair_scale_breaks(
-    model: pycolmap.Reconstruction, report: ModelReport, pairs: Sequence[VerifiedPair], xy: Sequence[Array],
-    total: int, reach: int, seed: int,
-) -> tuple[pycolmap.Reconstruction, ModelReport]:  # fmt: skip
-    """Return the model with both sides of its weak links at one scale, where enough matched features give it and the
-    result has fewer components without agreeing less; else as it is. Arguments as of `judge`."""
-    for seam in [s for s in report.seams if s.is_weak_link]:
-        owner = {k: n for n, component in enumerate(report.components) for k in component}
-        if {owner[k] for k in owner if k <= seam.before} & {owner[k] for k in owner if k >= seam.after}:
-            continue  # a loop holds the two sides
-        for shared in sorted((seam.before, seam.after), key=_ties(model, total, reach)):
-            ratio, count = scale_ratio(model, shared, pairs, xy, reach)
-            if count < MIN_POINTS:
-                continue
-            tried = pycolmap.Reconstruction(model)
-            rescale_after(tried, shared, ratio)
-            filter_outliers(tried)
-            complete_tracks(tried, pairs, seed)
-            # What follows only takes observations away.
-            if len(components_of(tried, total, reach)) >= len(report.components):
-                continue
-            bundle_adjust(tried, sorted(tried.reg_image_ids()), refine_camera=False, roughly=True)
-            filter_outliers(tried)
-            found = judge(tried, pairs, xy, total, reach)
-            if len(found.components) < len(report.components) and found.pairs_agreeing >= report.pairs_agreeing:
-                model, report = tried, found
-                break
-    return model, report
-
-
-def _ties(model: pycolmap.Reconstruction, total: int, reach: int) -> Callable[[int], int]:
-    """Of a keyframe: points seen before it, behind it and by three or more in all, near it."""
-    tracks = tracks_of(model, total)
-
-    def ties(k: int) -> int:
-        near = ([i for i in track if abs(i - k) <= reach] for track in tracks)
-        return sum(len(n) > 2 and n[0] < k < n[-1] for n in near)
-
-    return ties
-
-
-def scale_ratio(
-    model: pycolmap.Reconstruction, keyframe: int, pairs: Sequence[VerifiedPair], xy: Sequence[Array], reach: int
-) -> tuple[float, int]:
-    """Return the scale before a keyframe relative to the scale after it, as the median ratio of depths over features
-    matched on both sides, and their number. Each side's depth is that of the widest angle."""
-    camera, pose = model.cameras[1], pose_of(model.images[keyframe + 1])
-    rays = {keyframe: unit_rays(camera, xy[keyframe])}
-    depth, angle = np.ones((2, len(xy[keyframe]))), np.zeros((2, len(xy[keyframe])))
-    for pair in pairs:
-        if keyframe not in (pair.first, pair.second) or pair.second - pair.first > reach:
-            continue
-        other, mine = (pair.first, 1) if pair.second == keyframe else (pair.second, 0)
-        if other + 1 not in model.images or not model.images[other + 1].has_pose:
-            continue
-        features, side = pair.matches[:, mine], 1 - mine
-        motion = pose_of(model.images[other + 1]) @ np.linalg.inv(pose)
-        there = unit_rays(camera, xy[other])[pair.matches[:, 1 - mine]]
-        away, wide = _depths(motion, rays[keyframe][features], there)
-        better = (away > 0) & (wide > angle[side, features])
-        depth[side, features[better]], angle[side, features[better]] = away[better], wide[better]
-    both = (angle > _MIN_ANGLE).all(0)
-    ratio = np.log(depth[0, both] / depth[1, both])
-    return (float(np.exp(np.median(ratio))), int(both.sum())) if both.any() else (1.0, 0)
-
-
-def _depths(second_from_first: Array, first: Array, second: Array) -> tuple[Array, Array]:
-    """Depths (M,) along rays (M, 3) of the first camera where those of the second meet them, and the angles' sines."""
-    turned = np.cross(second, first @ second_from_first[:3, :3].T)
-    moved = np.cross(second, second_from_first[:3, 3])
-    square = np.maximum((turned**2).sum(1), 1e-20)
-    return -(turned * moved).sum(1) / square, np.sqrt(square)
-
-
-def rescale_after(model: pycolmap.Reconstruction, keyframe: int, ratio: float) -> None:
-    """Make everything after a keyframe, and the points that are seen mostly from there, larger by `ratio`, about
-    the keyframe's position, in place."""
-    image = keyframe + 1
-    centre = model.images[image].projection_center()
-    for i in model.reg_image_ids():
-        if i > image:
-            pose = model.images[i].cam_from_world().matrix()
-            pose[:, 3] = ratio * pose[:, 3] + (ratio - 1) * pose[:, :3] @ centre
-            set_pose(model, i, pose)
-    for point in model.points3D.values():
-        if np.mean([np.sign(e.image_id - image) for e in point.track.elements]) > 0:
-            point.xyz = centre + ratio * (point.xyz - centre)

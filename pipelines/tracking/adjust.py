@@ -132,8 +132,8 @@ def part_loose(state: TrackState, report: Report, intrinsics: Intrinsics, least:
         state.lost[i] = "what it shows does not determine its pose relative to the rest"
     for group in apart:
         inside = {ids[k] for k in group}
-        beside = {i for i in others if i in state.poses and state.nearest_keyframes(i, 1)[0] in inside}
-        state.detach(inside | beside)
+        following = {i for i in others if i in state.poses and state.nearest_keyframes(i, 1)[0] in inside}
+        state.detach(inside | following)
 
 
 def undo_rolling_shutter(

@@ -1,6 +1,7 @@
 """Stage 3: a pose for every frame, metric where the proxy depth is, and the sparse points that hold them together."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,8 @@ from ..run.files import (
     FRAME_OBSERVATIONS,
     FRAMES,
     GIVEN_POSES,
+    LOOPS,
+    MATCHED_PAIRS,
     SPARSE,
     TRAJECTORY,
 )
@@ -28,8 +31,10 @@ from ..system.wording import stretches
 from ..types import Frame
 from .adjust import Report, adjust_state, align_depths, has_independent_depth, part_loose
 from .front_end import FrontEnd
+from .graph import reprojection_error, spread_drift
+from .links import Link, LinkSearch, add_sightings
 from .pnp import MAX_GAP
-from .segments import carry_given, join_segments, split_segments
+from .segments import carry_given, split_segments
 from .state import (
     Pictures,
     TrackState,
@@ -43,6 +48,8 @@ from .state import (
 
 SNAPSHOT_EVERY, SNAPSHOTS = 50, 20
 """Frames between two; of a long recording no more are taken in all, since each holds all that is known so far."""
+_WORSE, _WORSE_PX = 1.5, 0.05
+"""By how much, as a factor and in pixels, links may raise the error of what was known before."""
 _LONG = 1.0
 """Seconds without a position from which a stretch is said to be filmed badly."""
 
@@ -53,7 +60,9 @@ def run(context: StageContext) -> dict[str, Any]:
 
 
 class TrackingStage:
-    """The steps of the stage; a `TrackState` holds the poses and points so far."""
+    """The steps of the stage; a `TrackState` holds the poses and points so far, `links` what joins them."""
+
+    links: Sequence[Link] = ()
 
     def __init__(self, context: StageContext) -> None:
         self.context, self.config = context, context.config
@@ -67,9 +76,8 @@ class TrackingStage:
         pictures = self.pictures
         state = self._track_frames()
         self._require_poses(state, 2 if self.context.run.find(GIVEN_POSES) is None else 1)
-        report = adjust_state(
-            state, pictures.intrinsics, pictures.proxy, self.is_metric, has_independent_depth(self.proxy)
-        )
+        report = self._adjust(state)
+        report = self._link(state) or report
         release_free_memory()
         part_loose(state, report, pictures.intrinsics, LEAST_PIECE)
         carried = carry_given(self.context, state)
@@ -83,6 +91,38 @@ class TrackingStage:
         self.context.save(FIGURES["tracking"], figures)
         self._warn_of_lost(state, pieces)
         return figures
+
+    def _adjust(self, state: TrackState) -> Report:
+        independent = has_independent_depth(self.proxy)
+        return adjust_state(state, self.pictures.intrinsics, self.pictures.proxy, self.is_metric, independent)
+
+    def _link(self, state: TrackState) -> Report | None:
+        """Join segments and close loops, in place, and adjust everything with the links that were found; None without
+        any, or where they contradict what was known before."""
+        context, intrinsics, before = self.context, self.pictures.intrinsics, deepcopy(state)
+        refused = {pair for pair, matches in context.run.load(MATCHED_PAIRS).items() if matches == 0}
+        search = LinkSearch(state, self.pictures, self.config.run.seed, refused)
+        joining = search.join_segments()
+        loops: list[Link] = []
+        if len(state.rig) == 1:  # the graph knows no places: loops of panoramas are those of structure from motion
+            loops = search.loops(lambda rows: context.progress.track(rows, "loops", len(rows)))
+        self.links = [*joining, *loops]
+        if not self.links:
+            return None
+        if len(state.rig) == 1:
+            spread_drift(state, self.links, intrinsics, before.segment)
+        add_sightings(state, self.links)
+        report = self._adjust(state)
+        was, now = (reprojection_error(s, intrinsics, before.sightings) for s in (before, state))
+        if now <= _WORSE * was + _WORSE_PX:
+            return report
+        context.warn(
+            f"{len(self.links)} links between keyframes were refused: with them the reprojection error of what was "
+            f"known before rises from {was:.2f} to {now:.2f} px"
+        )
+        self.links = []
+        vars(state).update(vars(before))
+        return None
 
     def _track_frames(self) -> TrackState:
         """Every frame visited once; goes on from the last snapshot."""
@@ -100,7 +140,6 @@ class TrackingStage:
         # Frames before the first keyframe could not be followed from anywhere; now there are neighbours behind them.
         for frame_id in sorted(state.lost, reverse=True):
             front_end.track(frame_id, may_start=False)
-        join_segments(state, self.pictures, seed)
         sync_rig_poses(state)
         return state
 
@@ -142,6 +181,7 @@ class TrackingStage:
         context.save(TRAJECTORY, to_trajectory(state, self.frames))
         context.save(SPARSE, model)
         context.save(FRAME_OBSERVATIONS, to_frame_observations(state))
+        context.save(LOOPS, [n.edge for n in self.links if {n.edge.frame1_id, n.frame_id} <= {*state.poses}])
         context.save(DEPTH_FIELDS, align_depths(model, report, self.pictures.intrinsics, self.pictures.proxy))
 
     def _figures(self, state: TrackState, report: Report) -> dict[str, Any]:
@@ -151,6 +191,7 @@ class TrackingStage:
             "posed": len(state.poses),
             "keyframes": len(state.keyframes),
             "lost": {str(i): reason for i, reason in sorted(state.lost.items())},
+            "links": len(self.links),
             "scale": "metric" if self.is_metric and world else "free",
             "scale_relative_sd": world.relative_sd if world else None,
             **report.figures,

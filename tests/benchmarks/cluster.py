@@ -36,7 +36,6 @@ WITH_TASKS = {
     "frames": "snapshot",
     "proxy": "snapshot",
     "mapping": "snapshot",
-    "global_ba": "snapshot/submaps",
     "export": "snapshot/mesh",
 }
 """Stages that submit tasks, and what of their unfinished folder is there once they have."""

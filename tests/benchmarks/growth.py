@@ -32,10 +32,10 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.camera import pixel_centers, project
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth, neighbours
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
-from msgs_slam.pipelines.global_ba.loops import loop_candidates
 from msgs_slam.pipelines.sfm.bundle import adjust_bundle
 from msgs_slam.pipelines.sfm.features import GlobalDescriptors, far_apart, loop_pairs, unit
 from msgs_slam.pipelines.tracking.adjust import make_bundle
+from msgs_slam.pipelines.tracking.links import loop_candidates
 from msgs_slam.pipelines.tracking.state import TrackState
 from msgs_slam.pipelines.types import Intrinsics
 from tests.benchmarks.worlds.building import HEIGHT, LENGTH, ROOM_WIDTH, Walk, module_at
@@ -121,7 +121,7 @@ def _loops_by_look(s: Synthetic) -> None:
 
 
 def _loop_candidates(s: Synthetic) -> None:
-    loop_candidates(s.model, GlobalDescriptors((s.looks,)), ())
+    loop_candidates(TrackState.from_backbone(s.model, 0.5), GlobalDescriptors((s.looks,)), ())
 
 
 def _bundle(s: Synthetic) -> None:
@@ -146,7 +146,7 @@ CASES: dict[str, tuple[str, Callable[[Synthetic], Any]]] = {
     "depth fields, tracking": ("views", _fields),
     "stereo: views to match, of 60 keyframes": ("model", _stereo),
     "loops by look, frames": ("looks", _loops_by_look),
-    "loops by look, global_ba": ("looks model", _loop_candidates),
+    "loops by look, tracking": ("looks model", _loop_candidates),
     "the segment of a point, a frame each": ("model", _segments),
     "bundle adjustment, two steps": ("model", _bundle),
 }

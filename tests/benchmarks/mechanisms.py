@@ -69,9 +69,6 @@ MECHANISMS = {
         lambda found, _: found is not None and not found[1].startswith("global"),
     ),
     "bridges": Mechanism(sfm, "weakly_connected", lambda *_: [], lambda weak, _: bool(weak)),
-    "mending of size": Mechanism(
-        candidates, "repair_scale_breaks", lambda model, report, *_: (model, report), lambda out, a: out[0] is not a[0]
-    ),
     "unfolding": Mechanism(
         candidates.CandidateModels, "_remap_from_neighbours", lambda *_: None, lambda found, _: found is not None
     ),

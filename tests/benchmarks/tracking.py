@@ -4,7 +4,7 @@
     python tests/benchmarks/tracking.py kitchen whiteroom_files      some of them
     python tests/benchmarks/tracking.py --set frames.overlap=4 --json rows.json
     python tests/benchmarks/tracking.py --colmap                     pycolmap's mappers too, self-calibrated
-    python tests/benchmarks/tracking.py --until global_ba            loops and the joint refinement as well
+    python tests/benchmarks/tracking.py --until mapping              poses as the map has refined them
     python tests/benchmarks/tracking.py --lengths 250 500 1000       a walk of that many frames in the made-up room
 
 ATE is the RMSE of camera centres in centimetres after Sim(3), or SE(3) where the depth is metric; `worst` is the camera

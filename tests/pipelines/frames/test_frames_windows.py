@@ -19,15 +19,11 @@ from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
 from msgs_slam.pipelines.run.reads import Reads, StageRecord
 from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.sfm.adjust import adjust_model, model_errors
-from msgs_slam.pipelines.sfm.consistency import judge
 from msgs_slam.pipelines.sfm.joining import (
     WIDE,
     Joined,
     adjust_together,
     merge_loop_points,
-    repair_scale_breaks,
-    rescale_after,
-    scale_ratio,
 )
 from msgs_slam.pipelines.sfm.lens import unknown_camera
 from msgs_slam.pipelines.sfm.matching import VerifiedPair
@@ -171,53 +167,6 @@ def test_windows_that_share_too_little_are_not_joined() -> None:
     joined, first = Joined(), moves()[0]
     assert joined.add(model_of(range(15), first, 1e-3)[0], 0)
     assert not joined.add(model_of(range(20, 35), first, 1e-3)[0], 20)
-
-
-def matched(xy: list[Array], numbers: list[NDArray[np.int64]]) -> list[VerifiedPair]:
-    """Neighbours' features of the same points."""
-    pairs = []
-    for a in range(COUNT):
-        for b in range(a + 1, min(a + 4, COUNT)):
-            _, i, j = np.intersect1d(numbers[a], numbers[b], return_indices=True)
-            pairs.append(VerifiedPair(a, b, np.stack([i, j], 1).astype(np.uint32), 2, np.zeros((3, 3, 3))))
-    return pairs
-
-
-def torn(at: int, ratio: float) -> tuple[pycolmap.Reconstruction, list[Array], list[VerifiedPair]]:
-    """The walk in two structures that share one keyframe, and no point; what lies behind it is larger by a ratio."""
-    model, xy = model_of(range(COUNT), moves()[0], 0.0)
-    pairs = matched(xy, [np.array([p for p, _ in view]) for view in seen()[1]])
-    rescale_after(model, at, ratio)
-    for point in sorted(model.point3D_ids()):
-        elements = [(e.image_id, e.point2D_idx) for e in model.points3D[point].track.elements]
-        behind = np.mean([np.sign(i - 1 - at) for i, _ in elements]) > 0
-        for image, feature in elements:
-            if (image - 1 > at) != behind and image - 1 != at and model.exists_point3D(point):
-                model.delete_observation(image, feature)
-    return model, xy, pairs
-
-
-@pytest.mark.parametrize("ratio", [5.9, 0.3])
-def test_a_path_that_lost_its_size_is_mended_by_what_matches(ratio: float) -> None:
-    model, xy, pairs = torn(20, ratio)
-    report = judge(model, pairs, xy, COUNT, 4)
-    assert sorted(len(p) for p in report.components) in ([20, 20], [19, 21])  # the shared keyframe goes with either
-    found, count = scale_ratio(model, 20, pairs, xy, 4)
-    assert found == pytest.approx(1 / ratio, rel=0.02)
-    assert count > 100
-    whole, better = repair_scale_breaks(model, report, pairs, xy, COUNT, 4, 0)
-    assert [len(p) for p in better.components] == [COUNT]
-    assert off_by(whole).max() < 0.02
-
-
-def test_a_path_that_nothing_holds_stays_in_parts() -> None:
-    model, xy, pairs = torn(20, 3.0)
-    apart = [p for p in pairs if (p.first <= 20) == (p.second <= 20)]
-    report = judge(model, apart, xy, COUNT, 4)
-    left, same = repair_scale_breaks(model, report, apart, xy, COUNT, 4, 0)
-    assert left is model
-    assert same is report
-    assert len(report.components) > 1
 
 
 def test_points_a_pixel_off_have_no_say_in_a_narrow_adjustment() -> None:

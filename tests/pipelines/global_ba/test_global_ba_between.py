@@ -21,13 +21,25 @@ from msgs_slam.pipelines.run.files import BACKBONE, EVERY_FRAME, FRAMES, LEFT_OU
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.run.target import Target
 from msgs_slam.pipelines.types import Trajectory
-from tests.pipelines.global_ba.test_global_ba_stage import BreakOff
 from tests.pipelines.tracking.conftest import MadeRun, make_run, open_stage, room_frames
 from tests.world.clip import WorldFrame
 
 __all__ = ["make_run", "open_stage", "room_frames"]
 EVERY = 3
 KEYFRAMES = (0, 6, 12, 18, 21)
+
+
+class BreakOff:
+    """Progress that stops in the middle of one piece of work."""
+
+    def __init__(self, label: str, after: int) -> None:
+        self.label, self.after = label, after
+
+    def track(self, items, label, total=None):  # type: ignore[no-untyped-def]
+        for n, item in enumerate(items):
+            if label == self.label and n == self.after:
+                raise KeyboardInterrupt
+            yield item
 
 
 @pytest.fixture

@@ -18,9 +18,8 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.mapping import optimise, submaps
 from msgs_slam.pipelines.mapping import stage as mapping_stage
-from msgs_slam.pipelines.mapping.stage import refine_map
 from msgs_slam.pipelines.mapping.submaps import BORDER, SeenExposures, common_exposure, divide, nearest_seeing
-from msgs_slam.pipelines.run.files import DEPTH_FIELDS, MAP, SUBMAPS, TRAJECTORY
+from msgs_slam.pipelines.run.files import SUBMAPS
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.outcome import load_outcome, maps_around
 from msgs_slam.pipelines.run.schema import RunFile
@@ -200,19 +199,6 @@ def finished(small_run: RunFolder, divided: tuple[Path, dict], tmp_path_factory:
     shutil.copytree(divided[0], run.stage("mapping"), ignore=shutil.ignore_patterns("snapshot"))
     note_finished(run, ("frames", "proxy", "tracking", "mapping"), CONFIG)
     return run
-
-
-def test_a_shaken_map_is_refined_in_its_parts(finished: RunFolder, tmp_path: Path) -> None:
-    gaussian_map = finished.load(MAP, "mapping")
-    noise = torch.randn(gaussian_map.colors.shape, generator=torch.Generator().manual_seed(0))
-    shaken = replace(gaussian_map, colors=gaussian_map.colors + 0.05 * noise)
-    context = StageContext(finished, finished.root, CONFIG, tmp_path, SilentProgress())
-    poses, fields = finished.load(TRAJECTORY, "mapping"), finished.load(DEPTH_FIELDS, "tracking")
-    refined = refine_map(context, shaken, poses, fields, 2.0)
-    assert refined.is_better
-    assert refined.psnr_after > refined.psnr_before + 1
-    assert 0.8 < len(refined.result.gaussian_map) / len(gaussian_map) < 1.6
-    assert refined.result.cam_from_world.shape == (14, 4, 4)
 
 
 def test_a_view_is_drawn_from_its_submap_and_those_beside_it(finished: RunFolder) -> None:

@@ -16,8 +16,8 @@ from msgs_slam.pipelines.sfm.flow import find_corners, follow
 from msgs_slam.pipelines.sfm.matching import match_descriptors
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.tracking.front_end import triangulate
+from msgs_slam.pipelines.tracking.links import agree
 from msgs_slam.pipelines.tracking.pnp import interpolate_pose, predict_pose, relocalise, solve_pose
-from msgs_slam.pipelines.tracking.segments import agree
 from msgs_slam.pipelines.tracking.state import NO_SIGHTINGS, Sightings, TrackState
 from msgs_slam.pipelines.types import Intrinsics
 from tests.pipelines.tracking.conftest import KnownBundle

@@ -28,7 +28,7 @@ from msgs_slam.pipelines.run.files import (
 )
 from msgs_slam.pipelines.run.stages import StageContext
 from msgs_slam.pipelines.sfm.features import global_descriptor
-from msgs_slam.pipelines.tracking import adjust, segments, stage
+from msgs_slam.pipelines.tracking import adjust, stage
 from msgs_slam.pipelines.tracking import state as tracking_state
 from msgs_slam.pipelines.tracking.stage import run as run_tracking
 from msgs_slam.pipelines.tracking.stage import stretches
@@ -110,25 +110,6 @@ def test_a_keyframe_is_described_once_however_often_frames_are_compared_with_it(
     assert len(described) == len(keyframes) + 4
     exact = [[float(looked_up.descriptor(1) @ looked_up.descriptor(k)) for k in keyframes]]
     assert 0 < np.abs(first - exact).max() < 1e-4
-
-
-def test_stretches_are_compared_again_only_with_what_has_joined_since(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Segment 2 is recognised at once, 3 only after 4, the others never."""
-    state, asked = TrackState(), []
-    sizes = {0: 9, 1: 8, 2: 7, 3: 6, 4: 5, 5: 4}
-    state.segment = {100 * s + n: s for s, count in sizes.items() for n in range(count)}
-
-    def join(segment: int, main: int, state: TrackState, *_: Any) -> bool:
-        asked.append(segment)
-        if segment not in (2, 4) and not (segment == 3 and 4 not in state.segment.values()):
-            return False
-        state.segment = {i: main if s == segment else s for i, s in state.segment.items()}
-        return True
-
-    monkeypatch.setattr(segments, "_join", join)
-    assert segments.join_segments(state, None, 0) == 3  # type: ignore[arg-type]
-    assert asked == [1, 2, 3, 4, 5, 1, 3, 5, 1]
-    assert set(state.segment.values()) == {0, 1, 5}
 
 
 def test_sparse_model_reprojects_and_scales_are_right(track: Track) -> None:

@@ -1,8 +1,9 @@
-"""Closing loops: a pose graph where there is drift, then bundle adjustment with the loops' own correspondences."""
+"""One graph over similarities: the keyframes of a world, what holds each to the next, and the links between them. It
+spreads what the links are off; the adjustment of everything follows."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,46 +12,18 @@ from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
 from ..geometry import se3
+from ..mapping.move_map import follow_keyframes
 from ..sfm.bundle import reprojection_errors
-from ..tracking.adjust import LoadProxy, Report, adjust_state
-from ..tracking.state import Sightings, TrackState
 from ..types import Array, Intrinsics
-from .loops import Loop
+from .links import Link
+from .state import Sightings, TrackState
 
-
-@dataclass(frozen=True)
-class Closed:
-    """The state after closing, how its adjustment went, and the median reprojection error before and after, pixels, of
-    the sightings that were there before the loops."""
-
-    state: TrackState
-    report: Report
-    error_before: float
-    error_after: float
-
-
-def adjust_with_loops(
-    state: TrackState,
-    loops: Sequence[Loop],
-    drifted: bool,
-    intrinsics: Intrinsics,
-    load_proxy: LoadProxy,
-    metric: bool,
-    use_depth: bool,
-) -> Closed:
-    """Adjust `state` (changed in place) with the loops."""
-    before = reprojection_error(state, intrinsics)
-    original = dict(state.sightings)
-    if drifted:
-        distribute_drift(state, loops)
-    add_sightings(state, loops)
-    report = adjust_state(state, intrinsics, load_proxy, metric, use_depth)
-    after = reprojection_error(state, intrinsics, original)
-    return Closed(state, report, before, after)
+DRIFT_PX = 6.0
+"""What the links are off at most, in pixels, without a graph."""
 
 
 def reprojection_error(
-    state: TrackState, intrinsics: Intrinsics, sightings: dict[int, Sightings] | None = None
+    state: TrackState, intrinsics: Intrinsics, sightings: Mapping[int, Sightings] | None = None
 ) -> float:
     """Median over the sightings (the state's, or those given), in pixels."""
     errors = []
@@ -60,52 +33,62 @@ def reprojection_error(
     return float(np.median(np.concatenate(errors)))
 
 
-def add_sightings(state: TrackState, loops: Sequence[Loop]) -> None:
-    """Each side of a loop sees the other side's points; a point already seen there keeps its first sighting."""
-    for loop in loops:
-        for frame_id, extra in ((loop.edge.frame2_id, loop.in_second), (loop.edge.frame1_id, loop.in_first)):
-            seen = state.sightings[frame_id]
-            state.sightings[frame_id] = seen.joined(extra.select(~np.isin(extra.point, seen.point)))
+def spread_drift(state: TrackState, links: Sequence[Link], intrinsics: Intrinsics, segment: Mapping[int, int]) -> None:
+    """Move keyframes, in place, to where the links and the ways between them agree best, and what they see along with
+    them, in the worlds whose links are off by more than `DRIFT_PX`; `segment` says of each keyframe which it was in
+    before any was joined."""
+    for world in sorted({state.segment[link.frame_id] for link in links}):
+        inside = [link for link in links if state.segment[link.frame_id] == world]
+        if max(link_px(link, state, intrinsics) for link in inside) > DRIFT_PX:
+            _spread(state, [k for k in state.keyframes if state.segment[k] == world], inside, segment)
 
 
-def distribute_drift(state: TrackState, loops: Sequence[Loop]) -> None:
-    """Spread the drift over the keyframes by a pose graph; points move with the first keyframe that sees them."""
-    ids = state.keyframes
-    place = {frame_id: n for n, frame_id in enumerate(ids)}
+def link_px(link: Link, state: TrackState, intrinsics: Intrinsics) -> float:
+    """Median distance in pixels between where the poses put a link's points in its keyframe and where it sees them."""
+    in_cam = se3.transform(state.poses[link.frame_id], state.points[link.seen.point])
+    longer = max(intrinsics.width, intrinsics.height)
+    return float(min(np.median(reprojection_errors(in_cam, link.seen.xy, intrinsics)), longer))
+
+
+def _spread(state: TrackState, ids: list[int], links: Sequence[Link], segment: Mapping[int, int]) -> None:
     old = np.array([state.poses[i] for i in ids])
-    depth = np.array([state.median_depth(i) for i in ids])
-    edges = _edges(old, depth, loops, place)
-    new, scales = optimise_pose_graph(old, np.ones(len(ids)), edges)
+    new, scales = optimise_pose_graph(old, np.ones(len(ids)), _edges(state, ids, links, segment))
+    others = np.array([i for i in sorted(state.poses) if state.segment[i] == state.segment[ids[0]]])
     _move_points(state, ids, old, new, scales)
-    for n, frame_id in enumerate(ids):
-        rigid = new[n].copy()
-        rigid[:3, 3] /= scales[n]
-        state.poses[frame_id] = rigid
+    new = new.copy()
+    new[:, :3, 3] /= scales[:, None]
+    poses = np.array([state.poses[i] for i in others.tolist()])
+    followed = follow_keyframes(others, poses, np.array(ids), old, new, 1 / scales)
+    state.poses |= dict(zip(others.tolist(), followed, strict=True))
+    state.poses |= dict(zip(ids, new, strict=True))
 
 
-def _edges(poses: Array, depth: Array, loops: Sequence[Loop], place: dict[int, int]) -> Edges:
-    """Each keyframe to the next two, and the loops."""
-    n = len(poses)
-    chain = [(i, i + step) for step in (1, 2) for i in range(n - step)]
-    first = [a for a, _ in chain] + [place[loop.edge.frame1_id] for loop in loops]
-    second = [b for _, b in chain] + [place[loop.edge.frame2_id] for loop in loops]
+def _edges(state: TrackState, ids: list[int], links: Sequence[Link], segment: Mapping[int, int]) -> Edges:
+    """Each keyframe to the next two of its segment, and the links."""
+    place, poses = {k: n for n, k in enumerate(ids)}, np.array([state.poses[i] for i in ids])
+    depth, loops = np.array([state.median_depth(i) for i in ids]), [link.edge for link in links]
+    own = [[n for n, k in enumerate(ids) if segment[k] == s] for s in sorted({segment[k] for k in ids})]
+    chain = [(a, b) for row in own for step in (1, 2) for a, b in zip(row, row[step:], strict=False)]
+    first = np.array([a for a, _ in chain] + [place[loop.frame1_id] for loop in loops])
+    second = np.array([b for _, b in chain] + [place[loop.frame2_id] for loop in loops])
     motions = [poses[b] @ se3.inverse(poses[a]) for a, b in chain]
     # An edge's translation comes in the first keyframe's scale.
-    motions += [se3.scaled(loop.edge.frame2_from_frame1, loop.edge.scale) for loop in loops]
-    scale = np.concatenate([np.ones(len(chain)), [loop.edge.scale for loop in loops]])
+    motions += [se3.scaled(loop.frame2_from_frame1, loop.scale) for loop in loops]
+    scale = np.concatenate([np.ones(len(chain)), [loop.scale for loop in loops]])
     length = np.array([np.linalg.norm(m[:3, 3]) for m in motions[: len(chain)]])
     sd = np.empty((len(first), 7))
-    sd[: len(chain), :3] = (0.02 * length + 0.002 * depth[np.array(first[: len(chain)])])[:, None]
+    sd[: len(chain), :3] = (0.02 * length + 0.002 * depth[first[: len(chain)]])[:, None]
     sd[: len(chain), 3:6] = np.radians(0.2)
     sd[: len(chain), 6] = 0.02
-    sd[len(chain) :, :3] = 0.01 * depth[np.array(second[len(chain) :])][:, None]
+    sd[len(chain) :, :3] = 0.01 * depth[second[len(chain) :]][:, None]
     sd[len(chain) :, 3:6] = np.radians(0.5)
-    sd[len(chain) :, 6] = 0.03
+    sd[len(chain) :, 6] = [link.scale_sd for link in links]
     robust = np.arange(len(first)) >= len(chain)
-    return Edges(np.array(first), np.array(second), np.array(motions), scale, sd, robust)
+    return Edges(first, second, np.array(motions), scale, sd, robust)
 
 
 def _move_points(state: TrackState, ids: list[int], old: Array, new: Array, scales: Array) -> None:
+    """Move points with the first keyframe that sees them."""
     owner = np.full(len(state.points), -1)
     for n in reversed(range(len(ids))):
         owner[state.sightings[ids[n]].point] = n
