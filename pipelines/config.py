@@ -64,8 +64,9 @@ class RunConfig:
     seed: int = setting(0, "seed of every random choice", within=(0, 2**31 - 1))
     threads: int = setting(0, "CPU threads, 0 = all cores; the same count gives the same bytes", within=(0, 1024))
     format: str = setting(
-        "auto", "kind of source: images (a video or plain images, whatever is next to them), or a data set, which "
-        "gives its times and camera, and with proxy.depth=files proxy.semantics=files its depth and labels; auto looks",
+        "auto", "kind of source: images (a video or plain images, ignoring files next to them) or a data set, "
+        "which supplies times and camera and, with proxy.depth=files proxy.semantics=files, depth and "
+        "labels; auto detects it",
         ("auto", "images", "7scenes", "replica", "tum", "euroc", "scannet", "sens", "nerfstudio", "colmap", "folder"),
         option=Option("format"),
     )  # fmt: skip
@@ -83,7 +84,8 @@ class RunConfig:
         option=Option("device"),
     )  # fmt: skip
     memory_mb: int = setting(
-        0, "plan with this much memory: given, long recordings are made in parts that fit. 0 = half of the machine's",
+        0, "memory to plan with, in MB; if given, long recordings are processed in parts that fit. 0 = "
+        "half of the machine's",
         within=(100, 10_000_000), or_zero=True,
     )  # fmt: skip
 
@@ -112,12 +114,14 @@ class FramesConfig:
         ("auto", "perspective", "equirectangular", "fisheye"), option=Option("camera"),
     )  # fmt: skip
     poses: str = setting(
-        "", "camera poses by another program to start from: a COLMAP model, a transforms.json, ARKit's JSON, a TUM "
+        "", "camera poses from another program to start from: a COLMAP model, a transforms.json, ARKit's JSON, a TUM "
         "trajectory or lines of 4x4 matrices; they may be inexact or incomplete", paths=("",),
         option=Option("poses", "FILE|FOLDER"),
     )  # fmt: skip
     rolling_shutter: str = setting(
-        "auto", "seconds from a frame's first row to its last; auto finds them, where they explain something; off"
+        "auto",
+        "rolling shutter: seconds from a frame's first row to its last; auto estimates them where "
+        "they explain something; off",
     )
     parallax: float = setting(
         0.025,
@@ -137,12 +141,12 @@ class FramesConfig:
         "black pixels are ignored", paths=("",), option=Option("masks", "FOLDER"),
     )  # fmt: skip
     people: str = setting(
-        "auto", "auto leaves out who moves, where networks for people are in the cache; mask everybody; keep nobody",
+        "auto", "auto masks people who move, if a person network is installed; mask: everybody; keep: nobody",
         ("auto", "mask", "keep"),
     )  # fmt: skip
     still: str = setting(
-        "auto", "auto leaves out what stands still in the image while the rest moves (a bonnet, a display, a frame "
-        "around it); keep takes it for scene", ("auto", "keep"),
+        "auto", "auto masks what stands still in the image while the rest moves (a car bonnet, an overlay, a "
+        "border); keep: it counts as scene", ("auto", "keep"),
     )  # fmt: skip
     mapper: str = setting("auto", "structure from motion at once or view by view", ("auto", "global", "incremental"))
 
@@ -161,7 +165,8 @@ class ProxyConfig:
         paths=("files:", "onnx:"), option=Option("semantics", "PROVIDER"),
     )  # fmt: skip
     classes: str = setting(
-        "", 'what to look for, "radiator, bookshelf, lamp", by a network for semantics whose card names a text encoder',
+        "", 'classes to look for, e.g. "radiator, bookshelf, lamp"; needs a semantics network whose card '
+        'names a text encoder',
         option=Option("classes", "WORDS"),
     )  # fmt: skip
     max_side: int = setting(
@@ -170,14 +175,14 @@ class ProxyConfig:
     depth_scale: float = setting(0.001, "metres per unit of integer depth files", within=(1e-9, 1000))
     scale_ref: str = setting(
         "",
-        "what makes metres without metric depth: IMAGE:X1,Y1,X2,Y2=METRES, two pixels of one image of the source "
+        "gives metres without metric depth: IMAGE:X1,Y1,X2,Y2=METRES, two pixels of one image of the source "
         "(an image's name or a video frame's number; the first pixel's centre is 0.5,0.5), height=METRES of the "
         "camera over the floor, or poses: those of frames.poses are in metres", option=Option("scale-ref", "REF"),
     )  # fmt: skip
     stereo_side: int = setting(
         640, "multiview matches images of this many pixels on the long side", within=(32, 4096), draft=320, best=960
     )
-    moving: str = setting("auto", "auto leaves out what moved, by depth and poses; keep maps it", ("auto", "keep"))
+    moving: str = setting("auto", "auto masks what moved, judged by depth and poses; keep maps it", ("auto", "keep"))
 
 
 @dataclass(frozen=True)
@@ -202,10 +207,11 @@ class MappingConfig:
     passes: float = setting(
         9.0, "how often each keyframe is visited once all are seeded", within=(0, 1000), draft=6.0, best=14.0
     )
-    min_iterations: int = setting(400, "at least this many such visits in all", within=(0, 10_000_000), draft=150)
-    max_gaussians: int = setting(1000000, "the map, or each submap, grows to this many", within=(100, 50_000_000))
+    min_iterations: int = setting(400, "at least this many visits in total", within=(0, 10_000_000), draft=150)
+    max_gaussians: int = setting(1000000, "most Gaussians of the map, or of each submap", within=(100, 50_000_000))
     submap: int = setting(
-        250, "more keyframes, or than run.memory_mb has room for, are mapped in overlapping parts of so many. 0: never",
+        250, "more keyframes than this, or than run.memory_mb has room for, are mapped in overlapping "
+        "parts of this many. 0 = never",
         within=(4, 1_000_000), or_zero=True,
     )  # fmt: skip
     depth_weight: float = setting(4.8, "λ_D of eq. (18); 0 = no depth loss", within=(0, 1000))
@@ -242,7 +248,9 @@ class ExportConfig:
         0.008, "voxel of the mesh, in units of the scene's median depth", within=(0.0005, 1), draft=0.014
     )
     planes: bool = setting(
-        True, "the mesh's floors, walls and fronts straight: what no match confirms moves onto the planes beside it"
+        True,
+        "flatten floors, walls and fronts of the mesh: parts that no match confirms are moved onto "
+        "the neighbouring planes",
     )
     image_side: int = setting(
         1600,
@@ -257,7 +265,7 @@ class ExportConfig:
         option=Option("scale"),
     )  # fmt: skip
     texture: bool = setting(
-        True, "mesh.glb has a texture of the keyframes; false: all vertices, with their colours", draft=False
+        True, "texture mesh.glb from the keyframes; false: all vertices with their colours", draft=False
     )
 
 
