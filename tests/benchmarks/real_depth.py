@@ -2,12 +2,12 @@
 
     python tests/benchmarks/real_depth.py cases DIR RUN=TRUTH ...        runs of `shape.py --recordings`, to DIR/NAME
     python tests/benchmarks/real_depth.py judge DIR [NAME ...] [--weights NPZ]
-    python tests/benchmarks/real_depth.py learn DIR NAME ... --made ROOMS --out NPZ [--steps 700]
+    python tests/benchmarks/real_depth.py learn DIR NAME ... --made ROOMS --out NPZ [--steps 300]
 
 A case is a keyframe's evidence and true depth, in the unit of the stereo by one scale for each keyframe. `judge` says
 of the pixels without a sure match: mean |log depth ratio| (at most 1), share off by more than 5 %, true over expected
 error where less than 4 % is expected. `learn` starts from the weights that come with the program, with their
-statistics of batches; every second step is of a recording, the others of the rooms of `rooms learn`. With one thread
+statistics of batches; every third step is of a recording, the others of the rooms of `rooms learn`. With one thread
 the same files give the same bytes. What ships may learn only from recordings whose licence allows it; the others
 judge.
 """
@@ -50,7 +50,7 @@ from tests.benchmarks.rooms.learning import (
 
 _MOST, _LEAST_PIXELS = 28, 200
 """Keyframes of a recording, and pixels of one whose truth is known."""
-_BATCH, _RATE, _WARMED = 2, 6e-4, 0.05
+_BATCH, _RATE, _WARMED = 2, 3e-4, 0.05
 _SURE, _OFF = 0.04, math.log(1.05)
 
 
@@ -104,20 +104,26 @@ def judge(network: CompletionNetwork, cases: list[Example]) -> tuple[float, floa
     return float(error.mean()), float((error > _OFF).mean()), float(error[sure].mean() / max(risk[sure].mean(), 1e-9))
 
 
-def learn(cases: dict[str, list[Example]], made: list[Example], steps: int) -> CompletionNetwork:
-    """Learn on; see the top of this file."""
+def by_size(folder: Path, pattern: str = "*_[01].npz") -> list[list[Path]]:
+    """List the cases that can make a batch: more than fit into memory together, so that they are read when drawn."""
+    groups: dict[tuple[int, ...], list[Path]] = {}
+    for path in sorted(folder.glob(pattern)):
+        case = _read(path)
+        if (~case.wanted.isnan()).sum() >= _LEAST_PIXELS:
+            groups.setdefault(tuple(case.given.planes.shape), []).append(path)
+    return [g for g in groups.values() if len(g) >= _BATCH]
+
+
+def learn(real: list[list[Path]], made: list[list[Path]], steps: int) -> CompletionNetwork:
+    """Learn on from cases by size, `real` ones a recording each; see the top of this file."""
     torch.manual_seed(0)
     rng, network = np.random.default_rng(0), network_of(None)
     optimizer = torch.optim.AdamW(network.parameters(), _RATE, weight_decay=2e-3)
-    rooms: dict[tuple[int, ...], list[Example]] = {}
-    for e in made:
-        rooms.setdefault(tuple(e.given.planes.shape[1:]), []).append(e)
-    groups = [list(cases.values()), [g for g in rooms.values() if len(g) >= _BATCH]]
     for step in range(steps):
-        kind = groups[step % 2] or groups[0]
-        share = np.array([1.0 if kind is groups[0] else len(g) for g in kind])
-        group = kind[rng.choice(len(kind), p=share / share.sum())]
-        batch = [group[i] for i in rng.choice(len(group), _BATCH, replace=False)]
+        groups = made if made and step % 3 else real
+        share = np.array([len(g) if groups is made else 1.0 for g in groups])
+        group = groups[rng.choice(len(groups), p=share / share.sum())]
+        batch = [_read(group[i]) for i in rng.choice(len(group), _BATCH, replace=False)]
         batch = [e.mirrored() if rng.random() < 0.5 else e for e in batch]
         for values in optimizer.param_groups:
             values["lr"] = max(_RATE * rate_at(step / steps, _WARMED), 1e-6)
@@ -150,7 +156,7 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, metavar="NPZ")
     parser.add_argument("--made", type=Path, metavar="ROOMS", help="folder of `rooms learn`")
     parser.add_argument("--out", type=Path, metavar="NPZ")
-    parser.add_argument("--steps", type=int, default=700)
+    parser.add_argument("--steps", type=int, default=300)
     given = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -160,8 +166,9 @@ def main() -> None:
     elif given.what == "judge":
         table(given.folder, given.names, given.weights)
     else:
-        made = load_cases(given.made / "examples", "[0-9]*.npz") if given.made else []
-        save_weights(learn({n: load_cases(given.folder / n) for n in given.names}, made, given.steps), given.out)
+        real = [g for name in given.names for g in by_size(given.folder / name)]
+        made = by_size(given.made / "examples", "[0-9]*.npz") if given.made else []
+        save_weights(learn(real, made, given.steps), given.out)
 
 
 if __name__ == "__main__":

@@ -146,13 +146,15 @@ def _walk_lines(
 
 @dataclass(frozen=True)
 class CompletionInputs:
-    """Basis of a completion: candidates and evidence (P, K, F) of the pixels that are not `sure` (h, w), by their
-    own match or by inverse depths that are lent (h, w)."""
+    """Basis of a completion: what a keyframe is `sure` of (h, w), by its own match or by inverse depths that are lent
+    (h, w); of P other `pixels` (flat indices), inverse depths of candidates (P, K) and evidence for them (P, K, F), and
+    what is known of each place (P, G)."""
 
     own: HalfResKeyframe
     lent: Array
     sure: NDArray[np.bool_]
-    found: Candidates
+    pixels: NDArray[np.int64]
+    inverse: Array
     evidence: Bytes
     place: Bytes
 
@@ -189,7 +191,8 @@ def build_inputs(
     found = find_candidates(own, borrowed, mass, sure)
     evidence = np.empty((*found.inverse.shape, OF_CANDIDATE), np.uint8)
     _weigh_support(found.pixels, found.support, found.weight, own.lab, evidence)
-    inputs = CompletionInputs(own, borrowed, sure, found, evidence, _describe_places(found.pixels, own, mass, sure))
+    places = _describe_places(found.pixels, own, mass, sure)
+    inputs = CompletionInputs(own, borrowed, sure, found.pixels, found.inverse, evidence, places)
     return update_view_evidence(inputs, lenders[:ASKED], asked)
 
 
@@ -200,7 +203,7 @@ def update_view_evidence(
     the keyframe's pixels to theirs."""
     evidence, own = inputs.evidence.copy(), inputs.own
     if views:
-        _ask_views(inputs.found.pixels, inputs.found.inverse, own.lab, *_stacked(views), np.stack(warps), evidence)
+        _ask_views(inputs.pixels, inputs.inverse, own.lab, *_stacked(views), np.stack(warps), evidence)
     else:
         evidence[..., 3:] = _NOTHING
     return replace(inputs, evidence=evidence)

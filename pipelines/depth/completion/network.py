@@ -1,4 +1,6 @@
-"""The network that weighs candidate depths by their evidence and by what lies around, learned on made rooms alone.
+"""The network that weighs candidate depths by their evidence and by what lies around.
+
+It learned on made rooms, then on these and on real recordings with measured depth (`docs/method.md`).
 
 Each candidate of a pixel is read by itself, then what all of them say of the pixel goes with colours, sure depths and
 their confidence through a U-Net (Ronneberger et al., MICCAI 2015), and comes back as the context in which each
@@ -47,7 +49,7 @@ _MOST_CORRECTION = 0.2
 _NEVER = -30.0
 _ALIKE = 0.02
 _TEMPERATURE = 2.0
-"""Log probabilities are divided by it: a network is surer of made rooms, which it learned, than of others."""
+"""Log probabilities are divided by it: a network is surer of what it learned on than of others."""
 _BLOCK = 1024
 """Pixels whose candidates are read at once."""
 
@@ -88,10 +90,10 @@ def inputs_of(inputs: CompletionInputs, device: str = "cpu") -> Inputs:
         *np.moveaxis(colors, -1, 0), *relative, own.inverse > 0, own.confidence, sure,
         _relative(inputs.lent, reference), np.log10(own.contrast + 1e-7) / 4 + 1,
     ]).astype(np.float32)  # fmt: skip
-    inverse = inputs.found.inverse
+    inverse = inputs.inverse
     real = inverse > 0
     logs = np.where(real, np.log(np.maximum(inverse, 1e-9)) - np.float32(reference), np.float32(0))
-    arrays = (planes, inputs.found.pixels, inputs.evidence, inputs.place, real, logs)
+    arrays = (planes, inputs.pixels, inputs.evidence, inputs.place, real, logs)
     planes_, pixels, evidence, place, there, of = (torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays)
     return Inputs(planes_, pixels, evidence, place, there, of, reference)
 
@@ -281,12 +283,12 @@ def complete(inputs: CompletionInputs, device: str) -> tuple[Array, Array]:
     given = inputs_of(inputs, device)
     found = weigh_candidates(given, device)
     error = np.exp(found.log_scale_known.cpu().numpy())
-    if len(inputs.found.pixels):
+    if len(inputs.pixels):
         logs, risk = (x.cpu().numpy() for x in mixture_median(found))
-        inverse.ravel()[inputs.found.pixels] = np.exp(logs + np.float32(given.reference))
+        inverse.ravel()[inputs.pixels] = np.exp(logs + np.float32(given.reference))
         smooth = cv2.bilateralFilter(np.log(np.maximum(inverse, 1e-9)), -1, _LIKE_DEPTH, max(inverse.shape) * _SMOOTHED)
         inverse = np.where(inputs.sure, inverse, np.exp(smooth))
-        error.ravel()[inputs.found.pixels] = risk
+        error.ravel()[inputs.pixels] = risk
     return invert(inverse), error
 
 
@@ -294,6 +296,13 @@ def to_confidence(inputs: CompletionInputs, error: Array) -> Array:
     """Return (h, w) confidence at half the size: of what is not sure by its expected error alone."""
     sure = np.where(inputs.from_other_views, LENT_CONFIDENCE, inputs.own.confidence)
     return np.where(inputs.sure, sure, _MOST_CONFIDENCE * np.exp(-error / _FADING)).astype(np.float32)
+
+
+def expected_error(confidence: Array) -> Array:
+    """Return the expected error in log depth of completed pixels (P,) from their confidence, as of `to_confidence`; of
+    sure pixels, which are left out, it says nothing."""
+    completed = confidence[(confidence > 0) & (confidence <= _MOST_CONFIDENCE)]
+    return np.asarray(-_FADING * np.log(completed / _MOST_CONFIDENCE), np.float32)
 
 
 def completed_keyframe(inputs: CompletionInputs, device: str) -> HalfResKeyframe:

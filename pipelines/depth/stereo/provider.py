@@ -49,7 +49,7 @@ _RANGE_VIEWS = 6
 """Their points say how near and far to look."""
 _CACHED_LENDERS = LENDERS + 4
 """What is kept of them at half the size. With no more of the fused depths each would be fused four to five times."""
-_CACHED_CASES = 6
+_CACHED_CASES = 12
 _BEST_ANGLE = 8.0
 """Degrees between the views of a pair."""
 _STOP = 0.02

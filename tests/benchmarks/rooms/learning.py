@@ -86,7 +86,7 @@ def room_cases(seed: int, folder: Path, device: str = "cpu") -> list[tuple[Compl
     return [
         (case, scaled(case, truth) if as_worn else truth)
         for case, truth in zip(cases, truths, strict=True)
-        if case is not None and len(case.found.pixels) >= _LEAST_PIXELS
+        if case is not None and len(case.pixels) >= _LEAST_PIXELS
     ]
 
 
@@ -169,7 +169,7 @@ class Example:
 def example_arrays(case: CompletionInputs, truth: Array) -> dict[str, NDArray]:
     """Return what is kept of a case and its true depth (h, w)."""
     given = inputs_of(case)
-    known, at, known_inverse_depth = truth > 0, case.found.pixels, case.known_inverse_depth
+    known, at, known_inverse_depth = truth > 0, case.pixels, case.known_inverse_depth
     wanted = -np.log(np.maximum(truth, 1e-6)) - np.float32(given.reference)
     relative = np.log(np.maximum(known_inverse_depth, 1e-9)) - np.float32(given.reference)
     logs, of_pixel = given.logs.numpy().clip(-6, 6), np.where(known, wanted, np.float32(np.nan)).ravel()[at]
@@ -195,7 +195,7 @@ def _leave_examples(job: tuple[int, Path, float, str]) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     for k, (case, truth) in enumerate(room_cases(seed, folder, device)):
-        if (truth.ravel()[case.found.pixels] > 0).sum() >= _LEAST_PIXELS // 2:
+        if (truth.ravel()[case.pixels] > 0).sum() >= _LEAST_PIXELS // 2:
             save_arrays(folder / "examples" / f"{seed}_{k}.npz", example_arrays(case, truth), compress=False)
 
 
