@@ -89,7 +89,7 @@ class AlignedDepth(DepthProvider):
     metric = False
     shared_state = ("_learned", "_fits")
 
-    def __init__(self, learned: OnnxDepth, sequence: Sequence, relative: str) -> None:
+    def __init__(self, learned: DepthProvider, sequence: Sequence, relative: str) -> None:
         """Raises InputError without a backbone: nothing else gives the frames' scales."""
         if sequence.backbone is None:
             raise InputError(

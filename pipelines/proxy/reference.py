@@ -3,38 +3,34 @@
 The user knows a distance in one image, how high the camera was held, or poses in metres.
 """
 
-import re
-from collections.abc import Callable
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ...formats.images import to_grey
+from ..config import Config
 from ..depth.fused import DepthScale
 from ..geometry.camera import unproject
-from ..geometry.sequence import Sequence, resize_area
+from ..geometry.sequence import resize_area
 from ..labels.segments import SegmentLabels
 from ..providers import MAX_CLASSES, DepthEstimate, DepthProvider
 from ..run.files import BACKBONE, GIVEN_POSES
 from ..run.folder import RunFolder
-from ..run.stages import StageContext
 from ..sfm.flow import follow
 from ..sfm.given import fit_given_poses
 from ..source.recording import Recording, VideoRecording, open_recording
-from ..types import Frame, Intrinsics
+from ..types import Frame
 
-Array = NDArray[np.float64]
-DepthOf = Callable[[Frame], DepthEstimate]
+if TYPE_CHECKING:
+    from .tasks import ProxyWork
 
-_NUMBER = r"\s*(\d+\.?\d*|\.\d+)\s*"
-_DISTANCE = re.compile(rf"(.+):{_NUMBER},{_NUMBER},{_NUMBER},{_NUMBER}={_NUMBER}m?")
-_HEIGHT = re.compile(rf"height\s*={_NUMBER}m?")
-POSES = "poses"
-"""The reference that says that given poses are in metres."""
+_POSES = "poses"
 _HOW = (
     "IMAGE:X1,Y1,X2,Y2=METRES (two pixels of one image of the source), height=METRES (camera over the floor) or "
     "poses (those given with --poses)"
@@ -49,11 +45,11 @@ _PIXEL_SD = 1.0
 
 @dataclass(frozen=True)
 class Reference:
-    """metres between `points` (2, 2), pixels of `picture` of the source; the camera's height where that is ""."""
+    """metres between two `pixels` (x1, y1, x2, y2) of `picture` of the source, without these the camera's height."""
 
     metres: float
     picture: str = ""
-    points: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0))
+    pixels: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -67,141 +63,121 @@ class ReferenceScale:
 
 def parse_reference(text: str) -> Reference | None:
     """The length a setting describes, None for "" and for poses. Raises InputError for a malformed one."""
-    text = text.strip()
-    if text in ("", POSES):
+    if text.strip() in ("", _POSES):
         return None
-    height, distance = _HEIGHT.fullmatch(text), _DISTANCE.fullmatch(text)
-    if height:
-        reference = Reference(float(height[1]))
-    elif distance:
-        x1, y1, x2, y2, metres = map(float, distance.groups()[1:])
-        reference = Reference(metres, distance[1].strip(), ((x1, y1), (x2, y2)))
-        if np.hypot(x2 - x1, y2 - y1) < _MIN_APART:
-            raise InputError(f"--scale-ref {text}: the two pixels are nearly the same; take points farther apart")
-    else:
-        raise InputError(f"--scale-ref {text}: expected {_HOW}")
-    if not 0 < reference.metres < 1e4:
-        raise InputError(f"--scale-ref {text}: {reference.metres} metres make no sense; give the length in metres")
-    return reference
+    what, _, length = text.strip().removesuffix("m").rpartition("=")
+    picture, _, pixels = what.rpartition(":")
+    try:
+        metres = float(length)
+        x: tuple[float, ...] = () if what.strip() == "height" else tuple(map(float, pixels.split(",")))
+        if x and (len(x) != 4 or not picture.strip()):
+            raise ValueError
+    except ValueError:
+        raise InputError(f"--scale-ref {text}: expected {_HOW}") from None
+    if not 0 < metres < 1e4:
+        raise InputError(f"--scale-ref {text}: {metres} metres make no sense; give the length in metres")
+    if x and np.hypot(x[2] - x[0], x[3] - x[1]) < _MIN_APART:
+        raise InputError(f"--scale-ref {text}: the two pixels are nearly the same; take points farther apart")
+    return Reference(metres, picture.strip(), x)
 
 
-def require_reference_in(source: Recording, text: str) -> None:
-    """Raise InputError for a reference that is malformed, to an image the source does not have, or outside it."""
-    reference = parse_reference(text)
-    if reference is None or not reference.picture:
+def require_reference(source: Path, config: Config) -> None:
+    """Raise InputError for a reference that is malformed, to an image the source does not have or outside it, or to
+    poses that are not given."""
+    text = config.proxy.scale_ref
+    if text.strip() == _POSES and not config.frames.poses:
+        raise InputError("--scale-ref poses needs poses: give them with --poses FILE|FOLDER")
+    if (known := parse_reference(text)) is None or not known.picture:
         return
-    _picture_index(source, reference.picture)
-    inside = all(0 <= x <= source.width and 0 <= y <= source.height for x, y in reference.points)
-    if not inside:
-        raise InputError(f"--scale-ref {text}: a pixel lies outside the image ({source.width}x{source.height})")
-
-
-def distance_scale(
-    reference: Reference, source: Recording, sequence: Sequence, frames: list[Frame], depth_of: DepthOf
-) -> ReferenceScale:
-    """The scale that makes the two points as far apart as they are known to be.
-
-    They are followed into the nearest keyframes and measured in each by its depth; the median counts. Raises
-    InputError when no keyframe near the image sees both with reliable depth.
-    """
-    index, camera = _picture_index(source, reference.picture), sequence.intrinsics
-    picture = next(iter(source.read({index})), None)
-    if picture is None:
-        raise InputError(f"--scale-ref: the source has no image {reference.picture}")
-    full_height, full_width = picture.rgb.shape[:2]
-    points = np.array(reference.points) * [camera.width / full_width, camera.height / full_height]
-    grey = to_grey(resize_area(picture.rgb, camera.width, camera.height))
-    lengths, relative_sds = [], []
-    for frame in sorted(frames, key=lambda f: (abs(f.source_index - index), f.id))[:_KEYFRAMES]:
-        other, found = to_grey(sequence.image(frame)), np.ones(2, bool)
-        # The one is an image of the source, the other without lens distortion: of one instant, too, points move.
-        at = points
-        if not np.array_equal(grey, other):
-            at, found = follow(grey, other, points, points, levels=4)
-        length = _length(at, depth_of(frame), camera) if found.all() else None
-        if length is not None:
-            lengths.append(length)
-            relative_sds.append(_PIXEL_SD * np.sqrt(2) / float(np.linalg.norm(at[1] - at[0])))
-    if not lengths:
-        raise InputError(
-            f"--scale-ref: no keyframe near image {reference.picture} has reliable depth at both points. Choose "
-            "corners of objects, in an image that was taken while moving"
-        )
-    length = float(np.median(lengths))
-    spread = 1.4826 * float(np.median(np.abs(np.array(lengths) / length - 1)))
-    return ReferenceScale(reference.metres / length, float(np.hypot(spread, np.median(relative_sds))), len(lengths))
+    recording = open_recording(source, config.run.format)
+    _picture_index(recording, known.picture)
+    width, height = recording.width, recording.height
+    if not all(0 <= x <= size for x, size in zip(known.pixels, (width, height) * 2, strict=True)):
+        raise InputError(f"--scale-ref {text}: a pixel lies outside the image ({width}x{height})")
 
 
 def _picture_index(source: Recording, picture: str) -> int:
     """Index in the source of an image: by its name, or the number of the video's frame."""
     if isinstance(source, VideoRecording):
         # Headers of videos may promise no frames at all.
-        if not picture.isdecimal() or 0 < source.expected_frames <= int(picture):
-            last = source.expected_frames - 1
-            raise InputError(f"--scale-ref: {picture} is no frame of {source.path}; give its number, from 0 to {last}")
-        return int(picture)
+        if picture.isdecimal() and not 0 < source.expected_frames <= int(picture):
+            return int(picture)
+        last = source.expected_frames - 1
+        raise InputError(f"--scale-ref: {picture} is no frame of {source.path}; give its number, from 0 to {last}")
     names = [source.name(i, i) for i in range(source.expected_frames)]
-    for i, name in enumerate(names):
-        if picture in (name, Path(name).stem):
-            return i
+    if found := [i for i, name in enumerate(names) if picture in (name, Path(name).stem)]:
+        return found[0]
     raise InputError(f"--scale-ref: the source has no image {picture}; give its name, for example {names[0]}")
 
 
-def _length(points: Array, estimate: DepthEstimate, camera: Intrinsics) -> float | None:
-    """Distance of two pixels (2, 2) in the depth's unit; None where a depth is not reliable."""
-    depths = []
-    for x, y in points.tolist():
-        rows = slice(max(int(y) - _PATCH, 0), int(y) + _PATCH + 1)
-        columns = slice(max(int(x) - _PATCH, 0), int(x) + _PATCH + 1)
-        sure = estimate.depth[rows, columns][estimate.confidence[rows, columns] >= _MIN_CONFIDENCE]
-        if x < 0 or y < 0 or len(sure) < _PATCH**2:
-            return None
-        depths.append(float(np.median(sure)))
-    first, second = unproject(points, np.array(depths), camera)
-    return float(np.linalg.norm(second - first))
-
-
-def reference_scale(
-    context: StageContext,
-    sequence: Sequence,
-    frames: list[Frame],
-    depths: DepthProvider,
-    scale: DepthScale,
-    depth_of: Callable[[Frame], DepthEstimate],
-) -> ReferenceScale | None:
+def reference_scale(work: ProxyWork, frames: list[Frame], scale: DepthScale) -> ReferenceScale | None:
     """Find the metres per unit of the depth by what the user knows; None without that, and where the depth is metric.
 
     Raises InputError when the reference cannot be measured in this scene.
     """
-    config = context.config.proxy
-    known = parse_reference(config.scale_ref)
-    if known is None:
-        return None if depths.metric else given_scale(context.run, scale, config.scale_ref.strip() == POSES)
+    text, depths = work.context.config.proxy.scale_ref, work.depths
+    if (known := parse_reference(text)) is None:
+        return None if depths.metric else _by_poses(work.context.run, scale, text.strip() == _POSES)
     if known.picture:
-        source = open_recording(context.source, context.config.run.format)
-        found = distance_scale(known, source, sequence, frames, depth_of)
+        lengths, pixel_sds = _distances(known, work, frames)
+        spread = 1.4826 * float(np.median(np.abs(lengths / np.median(lengths) - 1)))
+        relative_sd = np.hypot(spread, np.median(pixel_sds))
     else:
-        segments = SegmentLabels(sequence, MAX_CLASSES, context.progress)
-        heights = segments.heights(frames, lambda frame: scale.in_backbone_unit(depth_of(frame)))
-        if len(heights) == 0 or np.median(heights) <= 0:
-            raise InputError(
-                f"--scale-ref {config.scale_ref}: no floor was found in the scene. Give a distance between two points"
-            )
-        heights = heights * scale.value
-        height = float(np.median(heights))
-        found = ReferenceScale(known.metres / height, float(np.std(heights)) / height, len(heights))
-    if depths.metric:
-        context.warn(
-            f"{depths.name} is metric, so the reference {config.scale_ref} is not used; it would make lengths "
-            f"{found.factor - 1:+.1%} longer"
+        segments = SegmentLabels(work.sequence, MAX_CLASSES, work.context.progress)
+        lengths = segments.heights(frames, lambda frame: scale.in_backbone_unit(work.depth(frame))) * scale.value
+        if len(lengths) == 0 or np.median(lengths) <= 0:
+            raise InputError(f"--scale-ref {text}: no floor was found in the scene. Give a distance between two points")
+        relative_sd = np.std(lengths) / np.median(lengths)
+    factor = known.metres / float(np.median(lengths))
+    if not depths.metric:
+        return ReferenceScale(factor, float(relative_sd), len(lengths))
+    work.context.warn(
+        f"{depths.name} is metric, so the reference {text} is not used; it would make lengths {factor - 1:+.1%} longer"
+    )
+    return None
+
+
+def _distances(known: Reference, work: ProxyWork, frames: list[Frame]) -> NDArray[np.float64]:
+    """(2, K): how far apart the two points are by the depth of each of the nearest keyframes, into which they are
+    followed, and the part of it that is unsure because the user points at pixels.
+
+    Raises InputError when no keyframe near the image sees both with reliable depth.
+    """
+    source = open_recording(work.context.source, work.context.config.run.format)
+    index, camera = _picture_index(source, known.picture), work.sequence.intrinsics
+    picture = next(iter(source.read({index})), None)
+    if picture is None:
+        raise InputError(f"--scale-ref: the source has no image {known.picture}")
+    points = np.reshape(known.pixels, (2, 2)) * np.divide((camera.width, camera.height), picture.rgb.shape[1::-1])
+    grey = to_grey(resize_area(picture.rgb, camera.width, camera.height))
+    found: list[list[float]] = []
+    for frame in sorted(frames, key=lambda f: (abs(f.source_index - index), f.id))[:_KEYFRAMES]:
+        # The one is an image of the source, the other without lens distortion: of one instant, too, points move.
+        other, at, is_followed = to_grey(work.sequence.image(frame)), points, np.ones(2, bool)
+        if not np.array_equal(grey, other):
+            at, is_followed = follow(grey, other, points, points, levels=4)
+        depth = np.array([_depth_near(xy, work.depth(frame)) for xy in at[is_followed]])
+        if np.isfinite(depth).sum() == 2:
+            ends = unproject(at, depth, camera)
+            length, pixels = (float(np.linalg.norm(pair[1] - pair[0])) for pair in (ends, at))
+            found.append([length, _PIXEL_SD * np.sqrt(2) / pixels])
+    if not found:
+        raise InputError(
+            f"--scale-ref: no keyframe near image {known.picture} has reliable depth at both points. Choose corners of "
+            "objects, in an image that was taken while moving"
         )
-        return None
-    return found
+    return np.array(found).T
 
 
-def given_scale(run: RunFolder, scale: DepthScale, is_said: bool) -> ReferenceScale | None:
-    """Metres per unit of the depth by poses that the user gave in metres, by their kind or as it `is_said`; None where
-    these tell none."""
+def _depth_near(xy: NDArray[np.float64], estimate: DepthEstimate) -> float:
+    """Depth around a pixel; NaN where it is not reliable."""
+    rows, columns = (slice(max(int(v) - _PATCH, 0), int(v) + _PATCH + 1) for v in xy[::-1])
+    sure = estimate.depth[rows, columns][estimate.confidence[rows, columns] >= _MIN_CONFIDENCE]
+    return float(np.median(sure)) if min(xy) >= 0 and len(sure) >= _PATCH**2 else np.nan
+
+
+def _by_poses(run: RunFolder, scale: DepthScale, is_said: bool) -> ReferenceScale | None:
+    """By poses that the user gave in metres, by their kind or as it `is_said`; None where these tell none."""
     given, backbone = run.find(GIVEN_POSES), run.find(BACKBONE)
     if given is None or not (given.is_metric or is_said) or backbone is None:
         return None
@@ -217,18 +193,15 @@ def scale_figures(depths: DepthProvider, scale: DepthScale, reference: Reference
 
     independent_depth: whether depth adds to what tracking knows from the correspondences of the images.
     """
-    figures: dict[str, Any] = {"independent_depth": depths.metric}
+    found: dict[str, Any] = {"scale_from": "depth" if depths.metric else "nothing: lengths have no unit"}
     if reference is not None:
-        return figures | {
+        found = {
             "metric": True,
             "scale_from": "reference",
             "metres_per_unit": round(reference.factor * scale.value, 6),
             "reference_relative_sd": round(reference.relative_sd, 5),
             "reference_keyframes": reference.keyframes,
         }
-    if not depths.metric:
-        return figures | {"scale_from": "nothing: lengths have no unit"}
-    figures["scale_from"] = "depth"
-    if scale.of_frame:
-        figures |= {"metres_per_unit": round(scale.value, 6), "scale_spread": round(scale.spread, 5)}
-    return figures
+    elif depths.metric and scale.of_frame:
+        found |= {"metres_per_unit": round(scale.value, 6), "scale_spread": round(scale.spread, 5)}
+    return {"independent_depth": depths.metric, **found}

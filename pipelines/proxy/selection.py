@@ -12,27 +12,23 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from ...formats.datasets import Dataset
 from ...formats.errors import InputError, SettingError
 from ..config import Config, ProxyConfig
+from ..depth.files import LABELS, DatasetMaps, FilesDepth, FolderMaps, MapKind, depth_kind
 from ..geometry.sequence import Sequence
+from ..labels.files import FilesLabels
 from ..networks.card import Card, read_card
 from ..networks.network_pass import ResultCache, Workplace
 from ..networks.registry import ModelStore, default_cache, missing_networks
 from ..networks.words import with_words
 from ..providers import MAX_CLASSES, DepthProvider, SemanticsProvider
-from ..source.recording import FolderRecording, open_recording
+from ..source.recording import Recording, open_recording
 from ..system.progress import Progress, SilentProgress, log
 from ..types import Calibration, Frame, Intrinsics
 
 if TYPE_CHECKING:
-    from ..depth.files import FilesDepth
-    from ..depth.learned import OnnxDepth
     from ..depth.stereo.provider import MultiviewDepth
-    from ..labels.files import FilesLabels
-    from ..labels.learned import OnnxLabels
     from ..labels.segments import SegmentLabels
-    from .recording import RecordingDepth, RecordingLabels
 
 LEARNED_SPREAD = 0.02
 """Files whose depths stray by more from the triangulated points, relatively and within one frame, are taken for a
@@ -49,8 +45,8 @@ AUTO = ("auto", "best")
 @dataclass(frozen=True)
 class ProviderContext:
     """Inputs of every provider. `scratch(name)` is a folder that exists as long as the stage is unfinished; `recording`
-    is the source's data set, None for a video or plain images; people are left out of a frame, so that no place is one,
-    where `no_people`; with `may_fuse` False depth is what its provider says, never fused with multi-view depth."""
+    is the source; people are left out of a frame, so that no place is one, where `no_people`; with `may_fuse` False
+    depth is what its provider says, never fused with multi-view depth."""
 
     source: Path
     sequence: Sequence
@@ -59,32 +55,9 @@ class ProviderContext:
     threads: int
     device: str
     progress: Progress
-    recording: Dataset | None = None
+    recording: Recording | None = None
     no_people: bool = False
     may_fuse: bool = True
-
-
-def split_choice(text: str, setting: str, kinds: tuple[str, ...]) -> tuple[str, str]:
-    """`files:FOLDER` → ("files", "FOLDER"), and the name of a model NAME → ("onnx", "NAME").
-
-    Raises SettingError for a kind that does not exist or lacks its part.
-    """
-    kind, _, rest = text.strip().partition(":")
-    if kind not in kinds:
-        models = [m.name for m in ModelStore.open().models]
-        if text.strip() in models:
-            return "onnx", text.strip()
-        near = get_close_matches(kind, [*kinds, *models], n=1, cutoff=0.5)
-        guess = f"; did you mean {near[0]}?" if near else ""
-        raise SettingError(
-            f"{setting}: there is no provider or model {text!r}{guess or '.'} It is one of {', '.join(kinds)}, or a "
-            "network by its name in `msgs-slam models list`"
-        )
-    if kind == "onnx" and not rest:
-        raise SettingError(
-            f"{setting}: onnx needs the card of a network, onnx:CARD.toml, or its name in `msgs-slam models list`"
-        )
-    return kind, rest
 
 
 @dataclass(frozen=True)
@@ -98,12 +71,12 @@ class Choice:
 
 def choose_depth(config: ProxyConfig) -> Choice:
     """Raises InputError for a provider that does not exist or a card that is none."""
-    return _choose(config.depth, "proxy.depth", tuple(OWN_DEPTH), "depth")
+    return _choose(config.depth, "proxy.depth", OWN_DEPTH, "depth")
 
 
 def choose_semantics(config: ProxyConfig) -> Choice:
     """Raises InputError for a provider that does not exist or a card that is none."""
-    choice = _choose(config.semantics, "proxy.semantics", tuple(OWN_SEMANTICS), "segmentation")
+    choice = _choose(config.semantics, "proxy.semantics", OWN_SEMANTICS, "segmentation")
     if choice.card is None or choice.card.text is None:
         if config.classes:
             raise InputError(
@@ -119,12 +92,44 @@ def choose_providers(config: Config) -> tuple[Choice, Choice]:
     return choose_depth(config.proxy), choose_semantics(config.proxy)
 
 
-def _choose(text: str, setting: str, own: tuple[str, ...], task: str) -> Choice:
-    kind, rest = split_choice(text, setting, (*AUTO, *own, "files", "onnx"))
-    card = _cached(task, kind == "best") if kind in AUTO else _read(rest) if kind == "onnx" else None
-    if card is not None:
-        return Choice("onnx", card=card)
-    return Choice("files", rest) if kind == "files" else Choice(own[0] if kind in AUTO else kind)
+def _choose(text: str, setting: str, own: dict[str, Any], task: str) -> Choice:
+    """Of one of the `own`, `files:FOLDER`, `onnx:CARD`, the name of a model, or AUTO. Raises SettingError for a kind
+    that does not exist or lacks its part."""
+    kind, _, rest = text.strip().partition(":")
+    if kind in own or kind == "files":
+        return Choice(kind, rest)
+    store = ModelStore.open()
+    if kind in AUTO:
+        model = store.first_here(task)
+        if kind == "best":
+            model = max(store.all_here(task), key=lambda m: m.bytes, default=None)
+        return Choice(next(iter(own))) if model is None else Choice("onnx", card=store.card(model))
+    models = [m.name for m in store.models]
+    if text.strip() in models:
+        rest = text.strip()
+    elif kind != "onnx":
+        kinds = (*AUTO, *own, "files", "onnx")
+        near = get_close_matches(kind, [*kinds, *models], n=1, cutoff=0.5)
+        guess = f"; did you mean {near[0]}?" if near else "."
+        raise SettingError(
+            f"{setting}: there is no provider or model {text!r}{guess} It is one of {', '.join(kinds)}, or a network "
+            "by its name in `msgs-slam models list`"
+        )
+    elif not rest:
+        raise SettingError(
+            f"{setting}: onnx needs the card of a network, onnx:CARD.toml, or its name in `msgs-slam models list`"
+        )
+    return Choice("onnx", card=_card(store, rest))
+
+
+def _card(store: ModelStore, text: str) -> Card:
+    """The card of a file, or of a model in the cache by its name. Raises InputError when it is neither."""
+    model = next((m for m in store.models if m.name == text and not Path(text).exists()), None)
+    if model is None:
+        return read_card(Path(text))
+    if not store.is_here(model):
+        raise InputError(f"{text} is not in {store.cache}; run: msgs-slam models pull {text}")
+    return store.card(model)
 
 
 def open_depth(around: ProviderContext) -> DepthProvider:
@@ -132,29 +137,27 @@ def open_depth(around: ProviderContext) -> DepthProvider:
     choice = choose_depth(around.config)
     if choice.kind in OWN_DEPTH:
         return OWN_DEPTH[choice.kind](around)
-    from ..depth.learned import AlignedDepth, OnnxDepth
+    learned, backbone = open_given_depth(around, choice), around.sequence.backbone
+    if choice.card is not None and choice.card.relative:
+        from ..depth.learned import AlignedDepth
 
-    learned: DepthProvider = open_learned_depth(around, choice)
-    if isinstance(learned, OnnxDepth) and choice.card is not None and choice.card.relative:
         learned = AlignedDepth(learned, around.sequence, choice.card.relative)
-    return _fused(around, learned) if _wants_fusion(around, choice, learned) else learned
+    if not around.may_fuse or backbone is None or len(backbone.frame_ids) < 2:
+        return learned
+    from ..depth.fused import FusedDepth, measure_scale
+
+    if choice.card is None:  # a network's depth gains from multi-view depth, a sensor's does not
+        posed = [f for f in around.sequence.frames if f.id in around.sequence.cam_from_world]
+        strays = measure_scale(around.sequence, posed[:: len(posed) // _FILES_LOOKED_AT + 1], learned.estimate)
+        if not strays.spread_in or median(strays.spread_in.values()) <= LEARNED_SPREAD:
+            return learned
+    return FusedDepth(learned, _multiview(around), around.sequence)
 
 
-def _wants_fusion(around: ProviderContext, choice: Choice, learned: DepthProvider) -> bool:
-    """Whether the depth gains from multi-view depth: a network's does."""
-    if choice.card is not None or not around.may_fuse:
-        return around.may_fuse
-    from ..depth.fused import measure_scale
-
-    posed = [f for f in around.sequence.frames if f.id in around.sequence.cam_from_world]
-    strays = measure_scale(around.sequence, posed[:: len(posed) // _FILES_LOOKED_AT + 1], learned.estimate).spread_in
-    return bool(strays) and median(strays.values()) > LEARNED_SPREAD
-
-
-def open_learned_depth(around: ProviderContext, choice: Choice) -> FilesDepth | RecordingDepth | OnnxDepth:
+def open_given_depth(around: ProviderContext, choice: Choice) -> DepthProvider:
     """The provider of `files` or of a network, by itself."""
     if choice.card is None:
-        return open_depth_files(around, choice.folder)
+        return FilesDepth(_maps(around, depth_kind(around.config.depth_scale), choice.folder))
     from ..depth.learned import OnnxDepth
 
     return OnnxDepth(choice.card, _workplace(around, "network_depth"))
@@ -165,13 +168,13 @@ def open_semantics(around: ProviderContext) -> SemanticsProvider:
     choice = choose_semantics(around.config)
     if choice.kind in OWN_SEMANTICS:
         return OWN_SEMANTICS[choice.kind](around)
-    return open_learned_semantics(around, choice)
+    return open_given_semantics(around, choice)
 
 
-def open_learned_semantics(around: ProviderContext, choice: Choice) -> FilesLabels | RecordingLabels | OnnxLabels:
+def open_given_semantics(around: ProviderContext, choice: Choice) -> SemanticsProvider:
     """The provider of `files` or of a network, by itself."""
     if choice.card is None:
-        return open_label_files(around, choice.folder)
+        return FilesLabels(_maps(around, LABELS, choice.folder), around.progress)
     from ..labels.learned import OnnxClusters, OnnxLabels
 
     place = _workplace(around, "network_labels")
@@ -180,52 +183,14 @@ def open_learned_semantics(around: ProviderContext, choice: Choice) -> FilesLabe
     return OnnxLabels(choice.card, place, MAX_CLASSES, around.no_people)
 
 
-def open_depth_files(around: ProviderContext, folder: str) -> FilesDepth | RecordingDepth:
-    """The depth of a folder; without one, that of the data set itself, or files beside the source."""
-    from ..depth.files import FilesDepth
-    from .recording import RecordingDepth
-
-    if not folder and around.recording is not None:
-        return RecordingDepth(around.recording, around.sequence)
-    turns = _turns_of(around)
-    return FilesDepth(folder, around.source, around.sequence, around.config.depth_scale, turns)
-
-
-def open_label_files(around: ProviderContext, folder: str) -> FilesLabels | RecordingLabels:
-    """The labels of a folder; without one, those of the data set itself, or files beside the source."""
-    from ..labels.files import FilesLabels
-    from .recording import RecordingLabels
-
-    if not folder and around.recording is not None:
-        return RecordingLabels(around.recording, around.sequence, around.progress)
-    turns = _turns_of(around)
-    return FilesLabels(folder, around.source, around.sequence, around.progress, turns)
-
-
-def _turns_of(around: ProviderContext) -> dict[int, int]:
-    """Frame id → anticlockwise quarter turns by which its photo is read otherwise than upright, where it is."""
-    if around.recording is not None or not around.source.is_dir():
-        return {}
-    photos = FolderRecording(around.source)
-    return {f.id: turn for f in around.sequence.frames if (turn := photos.turns_from_upright(f.source_index))}
-
-
-def _read(text: str) -> Card:
-    """The card of a file, or of a model in the cache by its name. Raises InputError when it is neither."""
-    store = ModelStore.open()
-    model = next((m for m in store.models if m.name == text and not Path(text).exists()), None)
-    if model is None:
-        return read_card(Path(text))
-    if not store.is_here(model):
-        raise InputError(f"{text} is not in {store.cache}; run: msgs-slam models pull {text}")
-    return store.card(model)
-
-
-def _cached(task: str, largest: bool) -> Card | None:
-    """The card of the first learned model whose weights are in the cache, or of the one of the largest weights."""
-    store = ModelStore.open()
-    model = max(store.all_here(task), key=lambda m: m.bytes, default=None) if largest else store.first_here(task)
-    return None if model is None else store.card(model)
+def _maps(around: ProviderContext, kind: MapKind, folder: str) -> FolderMaps | DatasetMaps:
+    """Those of a folder; without one, those of the data set itself, or files beside the source."""
+    recording, frames = around.recording, around.sequence.frames
+    if not folder and recording is not None and (dataset := recording.dataset()) is not None:
+        return DatasetMaps(kind, dataset, around.sequence)
+    turns = {f.id: recording.turns_from_upright(f.source_index) for f in frames} if recording is not None else {}
+    path = kind.find_folder(folder, around.source)
+    return FolderMaps(kind, path, around.sequence, around.source.is_file(), turns)
 
 
 def _multiview(around: ProviderContext) -> MultiviewDepth:
@@ -249,15 +214,6 @@ OWN_SEMANTICS: dict[str, Callable[[ProviderContext], SemanticsProvider]] = {"seg
 """Providers that need neither files nor a network; a new one is a line here. `auto` falls back to the first."""
 
 
-def _fused(around: ProviderContext, learned: DepthProvider) -> DepthProvider:
-    """With the multi-view depth where structure from motion has poses for it."""
-    if around.sequence.backbone is None or len(around.sequence.backbone.frame_ids) < 2:
-        return learned
-    from ..depth.fused import FusedDepth
-
-    return FusedDepth(learned, _multiview(around), around.sequence)
-
-
 def _workplace(around: ProviderContext, scratch: str) -> Workplace:
     cache = ResultCache(default_cache() / "results", CACHE_MB)
     return Workplace(
@@ -268,29 +224,20 @@ def _workplace(around: ProviderContext, scratch: str) -> Workplace:
 def check_proxy(source: Path, config: Config) -> None:
     """InputError for a network that is not what its card says, a map of another shape than the images, maps that
     hold nothing, and a scale reference that makes no sense."""
-    from ..depth.files import FilesDepth, require_sizes
-    from ..labels.files import FilesLabels
-    from .reference import POSES, require_reference_in
+    from .reference import require_reference
 
-    if config.proxy.scale_ref.strip() == POSES and not config.frames.poses:
-        raise InputError("--scale-ref poses needs poses: give them with --poses FILE|FOLDER")
-    if config.proxy.scale_ref:
-        require_reference_in(open_recording(source, config.run.format), config.proxy.scale_ref)
+    require_reference(source, config)
     depth, semantics = choose_providers(config)
     if config.proxy.semantics == "auto" and (line := missing_networks()):
         log.warning(line)
-    if not {depth.kind, semantics.kind} & {"files", "onnx"}:
-        return
-    around = _before_frames(source, config)
     opened: list[object] = []
     if depth.kind in ("files", "onnx"):
-        opened.append(open_learned_depth(around, depth))
+        opened.append(open_given_depth(_before_frames(source, config), depth))
     if semantics.kind in ("files", "onnx"):
-        opened.append(open_learned_semantics(around, semantics))
+        opened.append(open_given_semantics(_before_frames(source, config), semantics))
     for provider in opened:
         if isinstance(provider, FilesDepth | FilesLabels):
-            require_sizes(provider.files(), provider.turned(), around.sequence)
-            provider.require_content()
+            provider.check()
 
 
 def _before_frames(source: Path, config: Config) -> ProviderContext:
@@ -306,4 +253,4 @@ def _before_frames(source: Path, config: Config) -> ProviderContext:
         raise AssertionError("providers are only opened here")
 
     sequence = Sequence(names, calibration, small, None, nothing)
-    return ProviderContext(source, sequence, config.proxy, nothing, 1, "cpu", SilentProgress(), pictures.dataset())
+    return ProviderContext(source, sequence, config.proxy, nothing, 1, "cpu", SilentProgress(), pictures)

@@ -52,7 +52,7 @@ class ProxyStage:
         self._warn_of_empty()
         scale = measure_scale(work.sequence, frames, work.computed_depth)
         moving = self._leave_out_moving(scale)
-        reference = reference_scale(self.context, work.sequence, frames, work.depths, scale, work.depth)
+        reference = reference_scale(work, frames, scale)
         self._compute_maps(scale, reference)
         figures = self._figures() | scale_figures(work.depths, scale, reference) | moving
         self._warn_of_focal(figures.get("network_focal_px"))
@@ -69,7 +69,7 @@ class ProxyStage:
         return self.work.posed(sequence.frames)
 
     def _warn_of_missing(self) -> None:
-        """Warn of frames without a map, and of map files that show the lens distortion which the frames have lost."""
+        """Warn of frames without a map."""
         for kind, provider in (("depth", self.work.depths), ("label", self.work.semantics)):
             missing = provider.missing(self.frames)
             if len(missing) == len(self.frames):
@@ -79,12 +79,6 @@ class ProxyStage:
                 self.warn(
                     f"{len(missing)} of {len(self.frames)} frames have no {kind} map, the first is {missing[0].name}"
                 )
-        strongest = max(map(abs, self.work.sequence.calibration.distortion))
-        if strongest > 0.005 and any(p.name.startswith("files:") for p in (self.work.depths, self.work.semantics)):
-            self.warn(
-                f"the frames were undistorted (coefficients up to {strongest:.3f}), but map files are taken as they "
-                "are: towards the borders they are some pixels off. Give maps of undistorted images"
-            )
 
     def _compute_depths(self) -> None:
         """Compute the depth of every frame and store it in the snapshot."""

@@ -49,7 +49,7 @@ class ProxyWork:
     def _around(self) -> ProviderContext:
         """What the providers are made from."""
         context, config = self.context, self.context.config
-        recording = open_recording(context.source, config.run.format).dataset()
+        recording = open_recording(context.source, config.run.format)
         return ProviderContext(
             context.source, self.sequence, config.proxy, lambda name: context.snapshot / name, context.threads,
             context.device, context.progress, recording, config.frames.people != "keep", config.run.method != "paper",

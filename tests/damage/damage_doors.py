@@ -54,7 +54,7 @@ from msgs_slam.formats.textfile import read_toml, write_json
 from msgs_slam.formats.trajectory import read_matrices, read_tum, write_tum
 from msgs_slam.formats.video import VideoReader, probe_video
 from msgs_slam.formats.video_streams import write_video
-from msgs_slam.pipelines.depth.files import _read as read_depth_file
+from msgs_slam.pipelines.depth.files import read_depth
 from msgs_slam.pipelines.evaluation.labels import read_class_map
 from msgs_slam.pipelines.frames.masks import open_masks
 from msgs_slam.pipelines.networks.card import Card, read_card
@@ -541,7 +541,7 @@ DOORS: dict[str, Door] = {
         lambda f: ResultCache(f, 1).save("k", {"depth": np.ones((6, 8))}), kept_result, mutate=in_zip
     ),
     "depth npy": Door(
-        lambda f: np.save(f / "a.npy", np.ones((6, 8), np.float32)), lambda p: read_depth_file(p, 0.001), "a.npy"
+        lambda f: np.save(f / "a.npy", np.ones((6, 8), np.float32)), lambda p: read_depth(p, 0.001), "a.npy"
     ),
     "video mp4": Door(make_video("a.mp4", ""), video, "a.mp4"),
     "video avi": Door(make_video("a.avi", "MJPG"), video, "a.avi"),

@@ -9,10 +9,10 @@ import pytest
 from PIL import Image
 from proxy_room import Room, write_source
 
-from msgs_slam.formats.datasets.sequence import find_class_table, read_class_table
+from msgs_slam.formats.datasets.sequence import Camera, find_class_table, read_class_table
 from msgs_slam.formats.errors import InputError
 from msgs_slam.formats.images import write_grey_png, write_rgb
-from msgs_slam.pipelines.depth.files import FilesDepth, frame_key, match_files
+from msgs_slam.pipelines.depth.files import LABELS, FilesDepth, FolderMaps, MapKind, depth_kind, frame_key
 from msgs_slam.pipelines.geometry.sequence import Sequence
 from msgs_slam.pipelines.labels.files import FilesLabels
 from msgs_slam.pipelines.providers import DepthEstimate
@@ -21,10 +21,11 @@ from msgs_slam.pipelines.proxy.selection import (
     check_proxy,
     choose_depth,
     choose_semantics,
-    open_learned_depth,
-    open_learned_semantics,
+    open_given_depth,
+    open_given_semantics,
 )
 from msgs_slam.pipelines.run.settings import load_config
+from msgs_slam.pipelines.sfm.lens import distortion_of, make_lens, to_pycolmap
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import VOID, Calibration, Frame, Intrinsics
 
@@ -34,12 +35,16 @@ def source(room: Room, tmp_path: Path) -> Path:
     return write_source(room, tmp_path / "source")
 
 
+def maps(kind: MapKind, source: Path, sequence: Sequence, folder: str = "") -> FolderMaps:
+    return FolderMaps(kind, kind.find_folder(folder, source), sequence, source.is_file())
+
+
 def depth_files(source: Path, room: Room, folder: str = "", unit: float = 0.001) -> FilesDepth:
-    return FilesDepth(folder, source, room.sequence(), unit)
+    return FilesDepth(maps(depth_kind(unit), source, room.sequence(), folder))
 
 
 def label_files(source: Path, room: Room) -> FilesLabels:
-    provider = FilesLabels("", source, room.sequence(), SilentProgress())
+    provider = FilesLabels(maps(LABELS, source, room.sequence()), SilentProgress())
     empty = DepthEstimate(np.zeros((1, 1), np.float32), np.zeros((1, 1), np.float32))
     provider.fit(room.frames, lambda frame: empty)
     return provider
@@ -60,13 +65,26 @@ def test_depth_files_give_the_depth_back(source: Path, room: Room) -> None:
 def test_maps_of_half_the_size_take_the_mean_of_one_surface_or_the_pixel_under_their_centres(
     source: Path, room: Room
 ) -> None:
-    half = FilesDepth("", source, room.sequence(128), 0.001).estimate(room.frames[1]).depth
+    half = FilesDepth(maps(depth_kind(0.001), source, room.sequence(128))).estimate(room.frames[1]).depth
     four = np.stack([room.views[1].depth[i::2, j::2] for i in (0, 1) for j in (0, 1)])
     is_one, has_edge = four.max(0) < 1.03 * four.min(0), four.max(0) > 1.1 * four.min(0)
     assert is_one.sum() > 0.9 * is_one.size
     assert has_edge.any()
     np.testing.assert_allclose(half[is_one], 1 / (1 / four).mean(0)[is_one], atol=1.1e-3)
     np.testing.assert_allclose(half[has_edge], four[3][has_edge], atol=5.1e-4)
+
+
+def test_files_have_the_lens_distortion_of_the_images_that_they_belong_to(tmp_path: Path) -> None:
+    lens = make_lens(to_pycolmap(Camera(320, 240, 258.0, 257.0, 159.0, 121.0, (-0.2, 0.03, 0.001, 0.0))))
+    ramp = np.tile(np.arange(1000, 2600, 5, dtype=np.uint16), (240, 1))
+    write_grey_png(tmp_path / "depth" / "a.png", ramp)
+    calibration = Calibration(lens.pinhole, "given", 0.0, distortion_of(lens.camera))
+    frame = Frame(0, "a.png", 0.0, 0, 1.0)
+    sequence = Sequence([frame], calibration, lens.pinhole, None, lambda f: np.zeros((240, 320, 3), np.uint8))
+    found = FilesDepth(maps(depth_kind(0.001), tmp_path / "rgb", sequence)).estimate(frame).depth
+    off = np.abs(found - (1 + 0.005 * lens.maps[0]))
+    assert 0 < off.max() < 0.0026  # half a pixel
+    assert np.abs(found - ramp / 1000).max() > 0.015
 
 
 def test_0_and_65535_are_unknown_and_float_files_are_metres(source: Path, room: Room) -> None:
@@ -143,8 +161,6 @@ def test_missing_folders_and_foreign_names_are_refused(source: Path, room: Room,
     write_grey_png(tmp_path / "foreign" / "kitchen.png", np.ones((192, 256), np.uint16))
     with pytest.raises(InputError, match=r"none of its 1 files \(kitchen.png"):
         depth_files(source, room, str(tmp_path / "foreign"))
-    with pytest.raises(InputError, match="must be positive"):
-        depth_files(source, room, unit=0)
 
 
 @pytest.mark.parametrize(
@@ -169,7 +185,7 @@ def test_a_number_that_several_have_says_nothing(
     for name in files:
         (tmp_path / name).write_bytes(b"")
     frames = [Frame(i, name, float(i), i, 1.0) for i, name in enumerate(images)]
-    found = match_files(tmp_path, (".png", ".npy"), ("depth",), frames, False)
+    found = depth_kind(1).match(tmp_path, frames, is_video=False)
     assert {i: path.name for i, path in found.items()} == expected
 
 
@@ -178,7 +194,7 @@ def test_a_video_matches_files_by_the_number_of_its_frame(source: Path, room: Ro
     video.write_bytes(b"only its name is looked at")
     picked = [replace(f, name=f"{i:06d}.jpg", id=i, source_index=2 * i) for i, f in enumerate(room.frames[:5])]
     sequence = replace(room.sequence(), frames=picked)
-    provider = FilesDepth("", video, sequence, 0.001)
+    provider = FilesDepth(maps(depth_kind(0.001), video, sequence))
     np.testing.assert_allclose(provider.estimate(picked[3]).depth, room.views[6].depth, atol=5.1e-4)
     assert provider.missing([*picked, replace(picked[0], id=9, source_index=99)])[0].id == 9
 
@@ -254,13 +270,13 @@ def test_files_of_photos_that_are_turned_alike_lie_as_these(tmp_path: Path, comm
     config = load_config(None, [depth, labels])
     check_proxy(tmp_path / "photos", config)
     around = replace(_before_frames(tmp_path / "photos", config), progress=SilentProgress())
-    found = open_learned_depth(around, choose_depth(config.proxy))
-    kinds = open_learned_semantics(around, choose_semantics(config.proxy))
+    found = open_given_depth(around, choose_depth(config.proxy))
+    kinds = open_given_semantics(around, choose_semantics(config.proxy))
     assert isinstance(kinds, FilesLabels)
     for i, frame in enumerate(around.sequence.frames):
         lying = np.rot90(sensor[i], turns[common[0]])
         np.testing.assert_allclose(found.estimate(frame).depth, lying / 10, rtol=1e-6)
-        np.testing.assert_array_equal(kinds._read(frame.id), lying)
+        np.testing.assert_array_equal(kinds._maps.read(frame.id), lying)
 
 
 @pytest.mark.parametrize("text", ["{", "[1, 2]", '{"classes": 3}', '{"-1": "a"}', "[]"])
@@ -280,10 +296,10 @@ def test_a_real_data_set_is_understood(
     frames = [Frame(i, p.name, 0.0, i, 1.0) for i, p in enumerate(sorted(source.iterdir()))]
     calibration = Calibration(camera, "given", 0, (0, 0, 0, 0))
     sequence = Sequence(frames, calibration, camera, None, lambda f: np.zeros((1, 1, 3), np.uint8))
-    depth = FilesDepth("", source, sequence, 0.001).estimate(frames[5])
+    depth = FilesDepth(maps(depth_kind(0.001), source, sequence)).estimate(frames[5])
     stored = cv2.imread(str(shared_data / folder / "depth" / f"{Path(frames[5].name).stem}.png"), -1)
     np.testing.assert_allclose(depth.depth, stored / 1000, rtol=1e-6)
-    labels = FilesLabels("", source, sequence, SilentProgress())
+    labels = FilesLabels(maps(LABELS, source, sequence), SilentProgress())
     labels.fit(frames, lambda f: depth)
     assert len(labels.classes()) == classes
     assert {"wall", "sofa", "tv-screen"} <= set(labels.classes().names)

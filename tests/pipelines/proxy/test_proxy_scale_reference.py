@@ -41,7 +41,7 @@ def test_references_are_read() -> None:
     assert parse_reference("  ") is None
     assert parse_reference("height=1.55") == Reference(1.55)
     assert parse_reference("height = 1.6 m") == Reference(1.6)
-    both = Reference(0.6, "IMG_12.png", ((310.0, 240.0), (402.0, 238.5)))
+    both = Reference(0.6, "IMG_12.png", (310.0, 240.0, 402.0, 238.5))
     assert parse_reference("IMG_12.png:310,240,402,238.5=0.60") == both
     assert parse_reference("IMG_12.png: 310, 240, 402, 238.5 = 0.60 m") == both
 
@@ -50,7 +50,8 @@ def test_references_are_read() -> None:
     ("text", "said"),
     [
         ("0.6", "expected IMAGE:X1"),
-        ("height=-1", "expected IMAGE:X1"),
+        ("100,20,300,20=1", "expected IMAGE:X1"),
+        ("height=-1", "make no sense"),
         ("height=0", "make no sense"),
         ("height=1.2.3", "expected IMAGE:X1"),
         ("000003.png:1,2,3=1", "expected IMAGE:X1"),
