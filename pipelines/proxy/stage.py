@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from ...formats.errors import InputError
+from ..depth.completion.network import expected_error
 from ..depth.files import NO_DEPTH
 from ..depth.fused import DepthScale, measure_scale
 from ..depth.stereo.provider import MultiviewDepth
@@ -56,7 +57,7 @@ class ProxyStage:
         self._compute_maps(scale, reference)
         figures = self._figures() | scale_figures(work.depths, scale, reference) | moving
         self._warn_of_focal(figures.get("network_focal_px"))
-        self._warn_of_guesses(figures["reliable_pixels"])
+        self._warn_of_guesses(figures["reliable_pixels"], figures.get("completed_error", 0.0))
         self.context.save(FIGURES["proxy"], figures)
         return figures
 
@@ -129,12 +130,12 @@ class ProxyStage:
             "camera"
         )
 
-    def _warn_of_guesses(self, reliable: float) -> None:
+    def _warn_of_guesses(self, reliable: float, error: float) -> None:
         """Warn where most of the depth is filled in: an image of the map does not show it."""
         if self.work.depths.name == MultiviewDepth.name and reliable < _MOSTLY_MATCHED:
             self.warn(
                 f"only {reliable:.0%} of the pixels could be matched between views; elsewhere (bare walls, plain "
-                "floors) depth is filled in from around them, and surfaces there may be 10% or more too close. Film "
+                f"floors) depth is filled in from around them and expected to be off by {error:.0%} on average. Film "
                 "closer and with more texture in view, or let a depth network help: `msgs-slam models pull --best`"
             )
 
@@ -156,18 +157,20 @@ class ProxyStage:
 
     def _figures(self) -> dict[str, Any]:
         """Summarise the stage for the report."""
-        sizes, reliable, void = [], [], []
+        sizes, reliable, void, errors = [], [], [], []
         invalid = 0
         for frame in self.frames:
-            path = PROXY_MAPS.path(self.context.folder, frame.id)
-            invalid += self.work.depth(frame).invalid
+            path, depth = PROXY_MAPS.path(self.context.folder, frame.id), self.work.depth(frame)
+            invalid += depth.invalid
+            errors.append(expected_error(depth.confidence))
             maps = PROXY_MAPS.read(path)
             sizes.append(path.stat().st_size)
             reliable.append(float((maps.confidence > 0.35).mean()))
             void.append(float((maps.labels == VOID).mean()))
         if invalid:
             self.warn(f"{invalid} depth values were NaN, infinite or negative; they count as unknown")
-        depths, semantics = self.work.depths, self.work.semantics
+        depths, semantics, error = self.work.depths, self.work.semantics, np.concatenate(errors)
+        completed = {"completed_error": round(float(error.mean()), 4)} if len(error) else {}
         return {
             "depth": depths.name,
             "semantics": semantics.name,
@@ -178,6 +181,7 @@ class ProxyStage:
             "void_pixels": round(float(np.mean(void)), 4),
             "kilobytes_a_frame": round(float(np.mean(sizes)) / 1000, 1),
             "invalid_depth_values": invalid,
+            **(completed if depths.name == MultiviewDepth.name else {}),
             **depths.figures(),
             **semantics.figures(),
         }

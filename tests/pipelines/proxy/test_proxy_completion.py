@@ -26,6 +26,7 @@ from msgs_slam.pipelines.depth.completion.network import (
     Mixture,
     complete,
     completed_keyframe,
+    expected_error,
     halved,
     inputs_of,
     load_network,
@@ -184,6 +185,7 @@ def test_a_blank_part_of_a_wall_is_completed_as_a_wall() -> None:
     assert error[blank].mean() < 0.3 * np.abs(np.log(case.own.inverse * truth))[blank].mean()
     assert error[blank].max() < 0.1
     np.testing.assert_array_equal(confidence[blank] < SURE, True)
+    np.testing.assert_allclose(expected_error(confidence), expected[blank], rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(
         depth[~blank & ~case.from_other_views], 1 / case.own.inverse[~blank & ~case.from_other_views], rtol=1e-6
     )

@@ -90,9 +90,12 @@ def test_depth_that_is_mostly_filled_in_is_said_to_be(
 ) -> None:
     monkeypatch.setattr("msgs_slam.pipelines.proxy.selection.STEREO_PLANES", planes)
     context = make_context("proxy.stereo_side=128")
-    share = run(context)["reliable_pixels"]
+    figures = run(context)
+    share, error = figures["reliable_pixels"], figures["completed_error"]
     said = [w for w in context.warnings if f"only {share:.0%} of the pixels could be matched" in w]
     assert bool(said) == is_warned
+    assert 0 < error < 1
+    assert all(f"off by {error:.0%} on average" in w for w in said)
 
 
 def something_moved(_: Any, view: Callable[[int], MovingView], *more: Any) -> dict[int, np.ndarray]:
