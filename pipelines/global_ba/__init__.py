@@ -1,6 +1,5 @@
-"""Stage 5: loops that tracking has left open are closed, and poses and map are adjusted together.
+"""Stage 5: poses of the images between the picked frames.
 
-In go the trajectory and the finished map, out come both without the drift, and poses of the images between the picked
-frames. Begin with `GlobalStage.run` in `stage.py`: `loops.py` proposes places seen again and measures them, `close.py`
-distributes the drift, `between.py` poses what lies between.
+In go the trajectory, the sparse model and the finished map, out come all of them as they are, with a pose for every
+image of a video. Begin with `run` in `stage.py`: `between.py` poses what lies between.
 """

@@ -2,5 +2,5 @@
 
 In go the backbone of structure from motion and the proxy's depths, out come the trajectory, its segments and the sparse
 model. Begin with `run` in `stage.py`: `front_end.py` poses the frames between keyframes, `adjust.py` adjusts them all,
-`segments.py` joins parts.
+`links.py` finds what joins segments and closes loops, `graph.py` spreads what is left of the drift.
 """
