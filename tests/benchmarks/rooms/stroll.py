@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, gaussian_filter1d
+from scipy.ndimage import distance_transform_edt, gaussian_filter1d, minimum_filter1d
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -20,7 +20,7 @@ from .textures import Random
 RATE, SIDES = 12, (480, 640)
 LEAST, MOST = 30, 90
 """Seconds."""
-_CELL, _BODY = 0.06, 0.24
+_CELL, _BODY, _CLEAR = 0.06, 0.24, 0.3
 _STEP = 0.02
 _FASTEST, _EAGER = math.radians(120), 4.5
 """Radians a second that the camera turns at most; how soon it follows, per second."""
@@ -205,7 +205,8 @@ def _filmed_along(legs: list[Array], order: list[int], returns: bool, lit: LitRo
         count = int(2.0 / _STEP)
         eyes.append(np.broadcast_to(eyes[-1][-1], (count, 3)))
         wanted.append(np.full(count, wanted[0][0]))
-    eye, yaw = np.concatenate(eyes) + tall * UP, _followed(np.concatenate(wanted))
+    yaw = _followed(np.concatenate(wanted))
+    eye = _held_out(np.concatenate(eyes) + tall * UP, yaw, r.uniform(0.25, 0.45), lit)
     times = np.arange(len(eye)) * _STEP
     pitch = -r.uniform(0.05, 0.25) + 0.08 * np.sin(times * r.uniform(0.5, 1) + r.uniform(0, 6.28))
     frequencies, amplitudes = waves(r)
@@ -247,6 +248,16 @@ def _bare_wall(eye: Array, yaw: float, lit: LitRoom) -> float | None:
         if np.median(depth) < _NEAR and (label == CLASSES.index("wall")).mean() > _BARE:
             return float(yaw + turn)
     return None
+
+
+def _held_out(body: Array, yaw: Array, reach: float, lit: LitRoom) -> Array:
+    """(N, 3) where the camera is: before the body, by as much as arms reach and things leave room."""
+    ahead = np.stack([np.cos(yaw), 0 * yaw, np.sin(yaw)], 1)
+    hit = lit.cast(body, ahead)
+    room = np.where(hit["primID"] >= 0, hit["tfar"], 1e3) - _CLEAR
+    span = 2 * int(0.5 / _STEP) + 1
+    held = gaussian_filter1d(minimum_filter1d(np.clip(room, 0, reach), span), span / 4)
+    return np.asarray(body + held[:, None] * ahead)
 
 
 def _followed(wanted: Array) -> Array:
