@@ -1,10 +1,11 @@
-"""GLB: glTF's document and its one buffer in a file; labelled meshes in it, with vertex colours or with a texture."""
+"""GLB: glTF's document and its one buffer in a file; meshes in it, a node a class, with vertex colours or a texture."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -14,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .atomic import atomic_path
-from .image_tags import light_of_srgb
+from .image_tags import light_of_srgb, srgb_of
 from .images import decode_rgb, jpeg_bytes
-from .ply import MeshBlocks
+from .ply import normal_sums
 from .reading import parsing, read_bytes
 
 _KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
@@ -27,6 +28,7 @@ _LINEAR, _MIPMAPPED, _CLAMPED = 9729, 9987, 33071
 UNLIT = "KHR_materials_unlit"
 LABEL = "_LABEL"
 """Attribute of the class numbers."""
+_UNNAMED = "unknown"
 
 
 def material(unlit: bool = True, **more: Any) -> dict[str, Any]:
@@ -80,22 +82,39 @@ def write_primitive(
     name: dict[str, str],
     extras: dict[str, Any] | None = None,
     extensions: Sequence[str] = (),
+) -> None:
+    """Write a scene of one mesh that is one `primitive` of these parts, as `write_primitives` does; `name` of mesh and
+    node."""
+    write_primitives(path, [(name, parts)], primitive, class_names, extras, extensions)
+
+
+def write_primitives(
+    path: Path,
+    nodes: Sequence[tuple[dict[str, str], Sequence[Part]]],
+    primitive: dict[str, Any],
+    class_names: Sequence[str],
+    extras: dict[str, Any] | None = None,
+    extensions: Sequence[str] = (),
     picture: bytes = b"",
 ) -> None:
-    """Write a scene of one mesh that is one `primitive` of these parts, class names in the mesh's extras; `name` of
-    mesh and node, `extras` of the document; the bytes of a `picture` are in the buffer view after the parts. Raises
-    ValueError where a part's blocks are not as long as it says, InputError when the disk refuses."""
+    """Write a scene of `nodes`, each a name and the parts of a mesh that is one `primitive`; class names in the meshes'
+    extras, `extras` of the document; the bytes of a `picture` are in the buffer view after the parts. Raises ValueError
+    where a part's blocks are not as long as it says, InputError when the disk refuses."""
+    parts, meshes = [part for _, of_node in nodes for part in of_node], []
     starts = np.cumsum([0, *(part.nbytes for part in parts), len(picture)]).tolist()
     views: list[dict[str, Any]] = [{"buffer": 0, "byteOffset": a, "byteLength": b - a} for a, b in pairwise(starts)]
     for view, part in zip(views, parts, strict=False):
         view["target"] = _VERTICES if part.name else _INDICES
-    attributes = {part.name: i for i, part in enumerate(parts) if part.name}
-    indices = {"indices": len(attributes)} if len(attributes) < len(parts) else {}  # they are the last
-    whole = {"attributes": attributes, **indices, **primitive}
+    rows = itertools.count()
+    for name, of_node in nodes:
+        row_of = {part.name: next(rows) for part in of_node}
+        indices = {"indices": row_of.pop("")} if "" in row_of else {}
+        whole = {"attributes": row_of, **indices, **primitive}
+        meshes.append({"primitives": [whole], **name, "extras": {"classes": list(class_names)}})
     document = glb_document(
         {"extensionsUsed": list(extensions)} if extensions else {},
-        {"primitives": [whole], **name, "extras": {"classes": list(class_names)}},
-        name,
+        meshes,
+        [name for name, _ in nodes],
         extras or {},
         [{"bufferView": i, **part.accessor()} for i, part in enumerate(parts)],
         views if picture else views[: len(parts)],
@@ -106,21 +125,21 @@ def write_primitive(
 
 def glb_document(
     extensions: dict[str, Any],
-    mesh: dict[str, Any],
-    node: dict[str, Any],
+    meshes: Sequence[dict[str, Any]],
+    nodes: Sequence[dict[str, Any]],
     extras: dict[str, Any],
     accessors: list[dict[str, Any]],
     views: list[dict[str, Any]],
     length: int,
 ) -> dict[str, Any]:
-    """Return the document of a scene of one mesh in one node, over a buffer of `length` bytes."""
+    """Return the document of a scene of meshes, each in a node of its own, over a buffer of `length` bytes."""
     return {
         "asset": {"version": "2.0", "generator": "msgs-slam"},
         **extensions,
         "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, **node}],
-        "meshes": [mesh],
+        "scenes": [{"nodes": list(range(len(nodes)))}],
+        "nodes": [{"mesh": number, **node} for number, node in enumerate(nodes)],
+        "meshes": list(meshes),
         **extras,
         "accessors": accessors,
         "bufferViews": views,
@@ -147,43 +166,17 @@ def write_glb(path: Path, document: dict[str, Any], parts: Sequence[Part], rest:
         file.write(rest + padding)
 
 
-def write_mesh_glb(
-    path: Path, mesh: MeshBlocks, class_names: tuple[str, ...] = (), gltf_from_world: NDArray[np.float64] | None = None
-) -> None:
-    """Write an unlit GLB with vertex colours, the labels as vertex attribute _LABEL, class names in the mesh's extras.
-
-    gltf_from_world (3, 3) turns the vertices: glTF wants y up. Errors as `write_mesh_ply`, ValueError for no faces.
-    """
-    if not mesh.face_count:
-        raise ValueError("write_mesh_glb: glTF has no way to store a mesh without faces")
-    turn = np.eye(3) if gltf_from_world is None else gltf_from_world.T
-
-    def positions() -> Iterator[NDArray[np.float32]]:
-        return ((points @ turn).astype(np.float32) for points, _, _ in mesh.vertices() if len(points))
-
-    ends = np.array([(points.min(0), points.max(0)) for points in positions()])
-    box = {"min": ends[:, 0].min(0).tolist(), "max": ends[:, 1].max(0).tolist()}
-    colors = (linear(colors / 255) for _, colors, _ in mesh.vertices())
-    parts = [
-        Part("POSITION", mesh.vertex_count, 3, "<f4", positions(), box),
-        Part("COLOR_0", mesh.vertex_count, 3, "<f4", colors),
-        # glTF wants every vertex at a multiple of 4 bytes: a float per label instead of a byte
-        Part(LABEL, mesh.vertex_count, 1, "<f4", (labels for _, _, labels in mesh.vertices())),
-        Part("", 3 * mesh.face_count, 1, "<u4", mesh.faces()),
-    ]
-    primitive, extras = {"mode": 4, "material": 0}, {"materials": [material()]}
-    write_primitive(path, parts, primitive, class_names, {"name": "mesh"}, extras, [UNLIT])
-
-
 @dataclass(frozen=True, eq=False)
-class TexturedMesh:
-    """vertices (V, 3) float32, labels (V,) uint8 (255 = no class), texture (H, W, 3) uint8.
+class ClassMesh:
+    """vertices (V, 3) float32 with colors (V, 3) uint8; labels (F,) uint8 of the faces (255 = no class); texture
+    (H, W, 3) uint8, without pixels for the vertices' colours in its place.
 
     corner_vertex (K,) int64 and corner_uv (K, 2) float32: a vertex has as many corners as charts meet there; u to the
     right and v downwards from the texture's top left, 0..1. faces (F, 3) int32 are corners.
     """
 
     vertices: NDArray[np.float32]
+    colors: NDArray[np.uint8]
     labels: NDArray[np.uint8]
     corner_vertex: NDArray[np.int64]
     corner_uv: NDArray[np.float32]
@@ -191,54 +184,80 @@ class TexturedMesh:
     texture: NDArray[np.uint8]
 
     def __post_init__(self) -> None:
-        v, k = len(self.vertices), len(self.corner_vertex)
-        expected = {"vertices": (v, 3), "labels": (v,), "corner_uv": (k, 2), "faces": (len(self.faces), 3)}
+        v, k, f = len(self.vertices), len(self.corner_vertex), len(self.faces)
+        if not f:
+            raise ValueError("ClassMesh: it has no faces, and glTF has no way to store that")
+        expected = {"vertices": (v, 3), "colors": (v, 3), "labels": (f,), "corner_uv": (k, 2), "faces": (f, 3)}
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
-                raise ValueError(f"TexturedMesh: {name}: got shape {getattr(self, name).shape}, expected {shape}")
-        if not len(self.faces):
-            raise ValueError("TexturedMesh: it has no faces")
+                raise ValueError(f"ClassMesh: {name}: got shape {getattr(self, name).shape}, expected {shape}")
         for name, indices, most in (("corner", self.faces, k), ("vertex", self.corner_vertex, v)):
             if not 0 <= indices.min() <= indices.max() < most:
-                raise ValueError(f"TexturedMesh: a {name} is outside the {most} there are")
+                raise ValueError(f"ClassMesh: a {name} is outside the {most} there are")
+
+    @property
+    def normals(self) -> NDArray[np.float32]:
+        """Return (V, 3) unit normals of the vertices: means over the faces around, by their areas."""
+        total = normal_sums(self.vertices.astype(np.float64), self.corner_vertex[self.faces])
+        length = np.linalg.norm(total, axis=1, keepdims=True)
+        return np.where(length > 0, total / np.maximum(length, 1e-300), [0, 0, 1]).astype(np.float32)
 
 
-def write_textured_glb(path: Path, mesh: TexturedMesh, class_names: tuple[str, ...] = ()) -> None:
-    """Write a GLB with the texture as a JPEG, shown as it is (KHR_materials_unlit), labels as attribute _LABEL.
+def write_mesh_glb(path: Path, mesh: ClassMesh, class_names: tuple[str, ...] = ()) -> None:
+    """Write a GLB with a node for each class, named after it, its number as attribute _LABEL; shown as it is
+    (KHR_materials_unlit), with the texture as a JPEG or with vertex colours.
 
     glTF wants y up: the caller turns the vertices. The same mesh gives the same bytes. Raises InputError when the disk
     refuses.
     """
-    parts = [
-        Part.of("POSITION", mesh.vertices[mesh.corner_vertex]),
-        Part.of("TEXCOORD_0", mesh.corner_uv),
-        Part.of(LABEL, mesh.labels[mesh.corner_vertex].astype(np.float32)),
-        Part.of("", mesh.faces.reshape(-1).astype(np.uint32)),
-    ]
+    normals, nodes = mesh.normals, []
+    for label in np.unique(mesh.labels).tolist():
+        corners, faces = np.unique(mesh.faces[mesh.labels == label], return_inverse=True)
+        vertex = mesh.corner_vertex[corners]
+        shown = Part.of("TEXCOORD_0", mesh.corner_uv[corners])
+        if not mesh.texture.size:
+            shown = Part.of("COLOR_0", linear(mesh.colors[vertex] / 255))
+        parts = [
+            Part.of("POSITION", mesh.vertices[vertex]),
+            Part.of("NORMAL", normals[vertex]),
+            shown,
+            # glTF wants every vertex at a multiple of 4 bytes: a float per label instead of a byte
+            Part.of(LABEL, np.full(len(corners), label, np.float32)),
+            Part.of("", faces.reshape(-1).astype(np.uint32)),
+        ]
+        nodes.append(({"name": class_names[label] if label < len(class_names) else _UNNAMED}, parts))
+    if not mesh.texture.size:
+        write_primitives(path, nodes, {"material": 0}, class_names, {"materials": [material()]}, [UNLIT])
+        return
     extras = {
         "materials": [material(baseColorTexture={"index": 0})],
         "textures": [{"source": 0, "sampler": 0}],
         "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPPED, "wrapS": _CLAMPED, "wrapT": _CLAMPED}],
-        "images": [{"bufferView": len(parts), "mimeType": "image/jpeg"}],
+        "images": [{"bufferView": 5 * len(nodes), "mimeType": "image/jpeg"}],
     }
-    picture = jpeg_bytes(mesh.texture)
-    write_primitive(path, parts, {"material": 0}, class_names, {"name": "mesh"}, extras, [UNLIT], picture)
+    write_primitives(path, nodes, {"material": 0}, class_names, extras, [UNLIT], jpeg_bytes(mesh.texture))
 
 
-def read_textured_glb(path: Path) -> TexturedMesh | None:
-    """Read a mesh by `write_textured_glb`, every corner a vertex of its own; None where it has no texture, as those by
-    `write_mesh_glb`. Raises InputError for another file."""
+def read_mesh_glb(path: Path) -> ClassMesh:
+    """Read a mesh by `write_mesh_glb`, every corner a vertex of its own. Raises InputError for another file."""
     data = read_bytes(path)
     with parsing(path, "mesh", "export it again"):
         document, binary = _document_and_buffer(data)
-        if "textures" not in document:
-            return None
         parts = [binary[v["byteOffset"] : v["byteOffset"] + v["byteLength"]] for v in document["bufferViews"]]
-        places, uv, labels = (np.frombuffer(part, "<f4") for part in parts[:3])
-        faces = np.frombuffer(parts[3], "<u4").reshape(-1, 3).astype(np.int32)
-        own = np.arange(len(labels))
-        picture = decode_rgb(parts[4], str(path))
-        return TexturedMesh(places.reshape(-1, 3), labels.astype(np.uint8), own, uv.reshape(-1, 2), faces, picture)
+        columns: list[list[NDArray[Any]]] = [[], [], [], [], []]
+        for first in range(0, 5 * len(document["meshes"]), 5):
+            of_node = [np.frombuffer(part, "<f4") for part in parts[first : first + 4]]
+            of_node.append(np.frombuffer(parts[first + 4], "<u4") + sum(map(len, columns[3])))
+            for column, values in zip(columns, of_node, strict=True):
+                column.append(values)
+        places, _, shown, labels, faces = (np.concatenate(column) for column in columns)
+        faces, count = faces.reshape(-1, 3).astype(np.int32), len(labels)
+        has_texture = "textures" in document
+        colors = np.zeros((count, 3), np.uint8) if has_texture else srgb_of(shown.reshape(-1, 3))
+        uv = shown.reshape(-1, 2) if has_texture else np.zeros((count, 2), np.float32)
+        picture = decode_rgb(parts[-1], str(path)) if has_texture else np.zeros((0, 0, 3), np.uint8)
+        of_faces = labels[faces[:, 0]].astype(np.uint8)
+        return ClassMesh(places.reshape(-1, 3), colors, of_faces, np.arange(count), uv, faces, picture)
 
 
 def _document_and_buffer(data: bytes) -> tuple[dict[str, Any], bytes]:

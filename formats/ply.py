@@ -200,3 +200,12 @@ def read_mesh_ply(path: Path) -> MeshArrays:
     faces = np.concatenate([np.zeros((0, 3), np.int32), *mesh.faces()])
     with parsing(path, "mesh", "export it again"):
         return MeshArrays(points, faces, colors, labels)
+
+
+def normal_sums(points: NDArray[np.float64], faces: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Return (V, 3) sums of the normals of the faces around, each twice as long as the face is large."""
+    corners, total = points[faces], np.zeros_like(points)
+    of_face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    for k in range(3):
+        np.add.at(total, faces[:, k], of_face)
+    return total

@@ -218,7 +218,9 @@ def write_compressed_glb(path: Path, cloud: GaussianCloud) -> None:
     mesh = {"primitives": [{"mode": 0, "attributes": attributes, "extensions": {EXTENSION: properties}}]}
     views, both = [{"buffer": 0, "byteLength": len(packed)}], [EXTENSION, COMPRESSION]
     extensions = {"extensionsUsed": both, "extensionsRequired": both}
-    write_glb(path, glb_document(extensions, mesh, {}, {}, list(accessors.values()), views, len(packed)), [], packed)
+    write_glb(
+        path, glb_document(extensions, [mesh], [{}], {}, list(accessors.values()), views, len(packed)), [], packed
+    )
 
 
 def _quat_xyzw_up(cloud: GaussianCloud) -> NDArray[np.float32]:

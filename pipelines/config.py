@@ -265,7 +265,10 @@ class ExportConfig:
         option=Option("scale"),
     )  # fmt: skip
     texture: bool = setting(
-        True, "texture mesh.glb from the keyframes; false: all vertices with their colours", draft=False
+        True, "texture mesh.glb from the keyframes; false: colours of its vertices", draft=False
+    )
+    triangles: int = setting(
+        500_000, "triangles of mesh.glb at most", within=(100, 10_000_000), draft=150_000, best=1_500_000
     )
 
 

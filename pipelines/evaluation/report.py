@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...formats.atomic import write_text
 from ...formats.datasets.sequence import distortion_names
-from ...formats.glb import read_textured_glb
+from ...formats.glb import read_mesh_glb
 from ...formats.reading import read_bytes
 from ...formats.textfile import read_json, read_text
 from ..config import SOURCE_LIST, Config, config_to_dict
@@ -127,13 +127,12 @@ def _advice_section(outcome: Outcome, sparse: SparseModel | None, loops: list[Lo
 
 
 def _mesh_section(outcome: Outcome) -> str:
-    """The mesh with its texture from a few cameras of the path; nothing where there is none, or not as it was left."""
+    """The mesh from a few cameras of the path; nothing where there is none, or not as it was left."""
     run, name = outcome.run, "mesh.glb"
     if not run.has("export", name) or name in run.damaged("export") or (world := run.find(WORLD)) is None:
         return ""
-    if (mesh := read_textured_glb(run.file("export", name))) is None:
-        return ""
     t, camera = outcome.moved(world.exported_from_run).trajectory, outcome.calibration.intrinsics.at_most(_TILE_WIDTH)
+    mesh = read_mesh_glb(run.file("export", name))
     mesh = replace(mesh, vertices=(mesh.vertices @ world.gltf_from_exported).astype(np.float32))
     rows = spread_sample(np.flatnonzero(t.is_keyframe).tolist(), 4)
     shown = ((mesh_picture(mesh, t.cam_from_world[row], camera), f"mesh, {t.timestamps[row]:.2f} s") for row in rows)

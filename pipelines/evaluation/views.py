@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...formats.glb import TexturedMesh
+from ...formats.glb import ClassMesh
 from ..providers import class_colors
 from ..render.api import median_depth, render
 from ..render.gaussian_map import GaussianMap, decided_channels
@@ -154,14 +154,18 @@ def class_colors_by_name(
     return [known.get(n.lower(), c or own) for n, c, own in zip(names, colors, class_colors(names), strict=True)]
 
 
-def mesh_picture(mesh: TexturedMesh, cam_from_world: Array, camera: Intrinsics) -> Picture:
-    """Draw a mesh with its texture, four samples a pixel, on white; `cam_from_world` (4, 4) is from the mesh's axes."""
+def mesh_picture(mesh: ClassMesh, cam_from_world: Array, camera: Intrinsics) -> Picture:
+    """Draw a mesh with its texture, or the colours of its vertices, four samples a pixel, on white; `cam_from_world`
+    (4, 4) is from the mesh's axes."""
     fine = camera.resized(2 * camera.width, 2 * camera.height)
     faces = mesh.corner_vertex[mesh.faces].astype(np.int32)
     drawn = draw_faces(mesh.vertices, faces, cam_from_world, fine)
     seen, (height, width) = drawn.face >= 0, mesh.texture.shape[:2]
-    place = np.einsum("nk,nkc->nc", drawn.shares[seen], mesh.corner_uv[mesh.faces[drawn.face[seen]]])
-    texel = (place * (width, height)).astype(np.int64).clip(0, (width - 1, height - 1))
-    shown = np.full((*seen.shape, 3), 255, np.uint8)
-    shown[seen] = mesh.texture[texel[:, 1], texel[:, 0]]
+    corners, shown = mesh.faces[drawn.face[seen]], np.full((*seen.shape, 3), 255, np.uint8)
+    values = mesh.corner_uv if mesh.texture.size else mesh.colors[mesh.corner_vertex]
+    found = np.einsum("nk,nkc->nc", drawn.shares[seen], values[corners])
+    if mesh.texture.size:
+        column, row = (found * (width, height)).astype(np.int64).clip(0, (width - 1, height - 1)).T
+        found = mesh.texture[row, column]
+    shown[seen] = found
     return np.asarray(cv2.resize(shown, (camera.width, camera.height), interpolation=cv2.INTER_AREA), np.uint8)

@@ -181,12 +181,13 @@ EXPORTS = (
             ),
             ExportedFile(
                 "mesh.glb",
-                "the surface with a tenth of those vertices and a texture made from the keyframes, exposure removed; "
-                "without export.texture, all vertices with their colours. Labels are the attribute _LABEL; unlit",
+                "a lighter surface, at most export.triangles, with normals and a node for each class, named after it "
+                "(attribute _LABEL: its number); a texture made from the keyframes, exposure removed, or without "
+                "export.texture colours of the vertices; unlit",
                 "Blender, game engines, the web",
             ),
         ),
-        "mesh.write_mesh", settings=("voxel", "planes", "texture"), when="always", also=("texture",),
+        "mesh.write_mesh", settings=("voxel", "planes", "texture", "triangles"), when="always", also=("texture",),
     ),
     Export(
         "collision", "a light mesh to walk in",
@@ -205,8 +206,8 @@ EXPORTS = (
         (
             ExportedFile(
                 "mesh.usdz",
-                "the mesh as USD: the texture of mesh.glb or else colours, the class of each vertex as primvar label, "
-                "y up, and the metres of a unit in its metersPerUnit",
+                "mesh.glb as USD: its texture or colours, the class of each face as primvar label, y up, and the "
+                "metres of a unit in its metersPerUnit",
                 "Quick Look on Apple devices, Blender, Houdini, Omniverse",
             ),
         ),

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ...formats.glb import write_mesh_glb, write_textured_glb
+from ...formats.glb import ClassMesh, write_mesh_glb
 from ...formats.ply import mesh_blocks, read_mesh_ply, write_mesh_ply
 from ..config import ExportConfig
 from ..geometry.camera import resample_nearest, unproject_depth
@@ -29,9 +29,10 @@ from ..system.progress import Progress
 from ..system.threads import get_threads, host_threads
 from ..system.values import load_value, save_value
 from ..types import VOID, Array
+from .light import SHARE, clustered, lightened, smoothed_rims
 from .scene import ExportScene
-from .surface import Region, chunk_surfaces, closed, joined, weld
-from .texture import make_textured
+from .surface import Region, chunk_surfaces, closed, filled, joined, weld
+from .texture import textured
 from .volume import BEHIND, Grid, fuse, make_grid
 
 TRUNCATION = 3.0
@@ -43,10 +44,6 @@ MAX_BLOCKS, LONG = 80_000, 200
 SURE = 0.5
 """Confidence of a proxy's depth from which the depth drawn there stays where it is."""
 _KEPT_BYTES = 100e6
-MAX_TEXTURED = 4_000_000
-"""Triangles of a mesh that is wrapped in a texture: an image of 4096 pixels a side shows a larger one no better than
-the colours of its vertices do."""
-
 _SIDE = 200
 _COMPARED = 24
 """Views whose median depth sets the size of a voxel."""
@@ -102,15 +99,18 @@ def write_mesh(scene: ExportScene, target: Target) -> None:
         in_chunks(context, fuse_views, regions, grid=grid, views=count, class_ids=class_ids)
         # Regions are loaded one at a time, whenever `joined` goes over them.
         write_mesh_ply(ply, joined(lambda: (load_value(_region_file(scratch, n)) for n in range(regions))), names)
-    mesh = mesh_blocks(ply)
-    if not mesh.face_count:
+    if not (mesh := read_mesh_ply(ply)).faces.size:
         context.warn("the mesh is empty: no surface is seen by enough keyframes")
-    elif mesh.face_count > MAX_TEXTURED or not settings.texture:
-        write_mesh_glb(glb, mesh, names, axes)
+        return
+    shown = DepthViews(views)
+    most = min(settings.triangles, round(SHARE * len(mesh.faces))) if settings.texture else settings.triangles
+    light, labels = lightened(filled(smoothed_rims(clustered(mesh)), shown), most)
+    if settings.texture:
+        made = textured(outcome, light, labels, shown, context.progress)
     else:
-        textured = make_textured(outcome, read_mesh_ply(ply), DepthViews(views), context.progress)
-        turned = replace(textured, vertices=(textured.vertices @ axes.T).astype(np.float32))
-        write_textured_glb(glb, turned, names)
+        uv, nothing = np.zeros((len(light.vertices), 2), np.float32), np.zeros((0, 0, 3), np.uint8)
+        made = ClassMesh(light.vertices, light.colors, labels, np.arange(len(uv)), uv, light.faces, nothing)
+    write_mesh_glb(glb, replace(made, vertices=(made.vertices @ axes.T).astype(np.float32)), names)
 
 
 def _scratch(context: StageContext) -> Path:

@@ -9,13 +9,12 @@ from scipy.spatial import ConvexHull, QhullError
 
 from ...formats.atomic import atomic_path, require_room, temporary_folder
 from ...formats.errors import InputError, install_extra
-from ...formats.glb import Part, TexturedMesh, linear, material, write_primitive
+from ...formats.glb import ClassMesh, Part, linear, material, write_primitive
 from ...formats.images import write_rgb
-from ...formats.ply import MeshArrays
 from ..run.target import Target
 from ..types import Array
+from .light import simplified
 from .scene import ExportScene
-from .texture import simplified
 
 USD, COLLISION = "mesh.usdz", "collision.glb"
 _TEXTURE = "texture.jpg"
@@ -26,7 +25,7 @@ MAX_FACES = 20_000
 def write_collision(scene: ExportScene, target: Target) -> None:
     """Write collision.glb: no colours, y up. Raises InputError where the run has no mesh, or an empty one."""
     mesh, world = scene.mesh(), scene.world
-    light = simplified(mesh, MAX_FACES / len(mesh.faces)) if len(mesh.faces) > MAX_FACES else mesh
+    light = simplified(mesh, MAX_FACES)
     points, faces = light.vertices.astype(np.float64), light.faces
     if world.axes == "up" and world.has_floor:
         points, faces = with_floor(points, faces)
@@ -48,7 +47,7 @@ def with_floor(points: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[N
 
 
 def write_usd(scene: ExportScene, target: Target) -> None:
-    """Write mesh.usdz: y up, the texture of mesh.glb or else a colour at each vertex, and the class of each vertex.
+    """Write mesh.usdz: y up, the mesh of mesh.glb with its normals, texture or colours, and the class of each face.
 
     Raises InputError where usd-core is not installed, or the run has no mesh, or an empty one.
     """
@@ -56,13 +55,14 @@ def write_usd(scene: ExportScene, target: Target) -> None:
         import pxr  # noqa: F401
     except ImportError as error:
         raise InputError(f"USD needs the package usd-core, which is not installed: {install_extra('usd')}") from error
-    mesh, names = scene.textured_mesh() or scene.mesh(), scene.outcome.classes.names
-    write_usdz(target.path(USD), mesh, names, scene.world.gltf_from_exported, scene.metres_per_unit)
+    if (mesh := scene.light_mesh()) is None:
+        raise InputError(f"{scene.outcome.run.root}: the mesh is empty, so there is nothing to write: film it again")
+    write_usdz(
+        target.path(USD), mesh, scene.outcome.classes.names, scene.world.gltf_from_exported, scene.metres_per_unit
+    )
 
 
-def write_usdz(
-    path: Path, mesh: MeshArrays | TexturedMesh, names: tuple[str, ...], turn: Array, metres_per_unit: float
-) -> None:
+def write_usdz(path: Path, mesh: ClassMesh, names: tuple[str, ...], turn: Array, metres_per_unit: float) -> None:
     """Write a package with one binary layer in it, and the texture where the mesh has one; `turn` (3, 3) makes y up.
     Raises DiskFullError where there is no room for it."""
     from pxr import Usd, UsdGeom, UsdUtils
@@ -75,39 +75,33 @@ def write_usdz(
         root = UsdGeom.Xform.Define(stage, "/Scene")
         stage.SetDefaultPrim(root.GetPrim())
         shape = UsdGeom.Mesh.Define(stage, "/Scene/Mesh")
-        if isinstance(mesh, TexturedMesh):
+        _fill(shape, mesh, names, turn)
+        if mesh.texture.size:
             write_rgb(scratch / _TEXTURE, mesh.texture)
-            corner = mesh.corner_vertex
-            _fill(shape, mesh.vertices[corner] @ turn.T, mesh.faces, mesh.labels[corner], names)
             _paint(stage, shape, _add_texture(stage, shape, mesh.corner_uv))
         else:
-            _fill(shape, mesh.vertices @ turn.T, mesh.faces, mesh.labels, names)
-            _paint(stage, shape, _add_colors(stage, shape, mesh.colors))
+            _paint(stage, shape, _add_colors(stage, shape, mesh.colors[mesh.corner_vertex]))
         stage.Save()
         package = scratch / USD
         UsdUtils.CreateNewUsdzPackage(str(layer), str(package))
         package.replace(temporary)
 
 
-def _fill(
-    shape: Any,
-    points: NDArray[np.floating],
-    faces: NDArray[np.int32],
-    labels: NDArray[np.uint8],
-    names: tuple[str, ...],
-) -> None:
-    """Triangles, and the number of each vertex's class as the primvar `label`."""
+def _fill(shape: Any, mesh: ClassMesh, names: tuple[str, ...], turn: Array) -> None:
+    """Triangles with normals, and the number of each face's class as the primvar `label`."""
     from pxr import Sdf, UsdGeom, Vt
 
-    points = points.astype(np.float32)
+    points, normals = ((a[mesh.corner_vertex] @ turn.T).astype(np.float32) for a in (mesh.vertices, mesh.normals))
     shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
-    shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
-    shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
+    shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
+    shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
+    shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.astype(np.int32).ravel()))
     shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     shape.CreateDoubleSidedAttr(True)
     shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
-    primvar = UsdGeom.PrimvarsAPI(shape).CreatePrimvar("label", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.vertex)
-    primvar.Set(Vt.IntArray.FromNumpy(labels.astype(np.int32)))
+    primvar = UsdGeom.PrimvarsAPI(shape).CreatePrimvar("label", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.uniform)
+    primvar.Set(Vt.IntArray.FromNumpy(mesh.labels.astype(np.int32)))
     shape.GetPrim().SetCustomDataByKey("classes", Vt.StringArray(list(names)))
 
 

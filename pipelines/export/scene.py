@@ -7,7 +7,7 @@ import numpy as np
 from torch import Tensor
 
 from ...formats.errors import InputError
-from ...formats.glb import TexturedMesh, read_textured_glb
+from ...formats.glb import ClassMesh, read_mesh_glb
 from ...formats.ply import MeshArrays, read_mesh_ply
 from ...formats.splats import GaussianCloud
 from ..config import ExportConfig
@@ -56,13 +56,12 @@ class ExportScene:
         """Read the mesh that the run's own export has made, as `mesh_of_run`."""
         return mesh_of_run(self.outcome.run, self.world)
 
-    def textured_mesh(self) -> TexturedMesh | None:
-        """Read the textured mesh that the run's own export has made, z up; None where it has none."""
+    def light_mesh(self) -> ClassMesh | None:
+        """Read the lighter mesh that the run's own export has made, z up; None where it has none."""
         run, own = self.outcome.run, self.outcome.run.find(WORLD)
         if own is None or not run.has("export", MESH_GLB):
             return None
-        if (mesh := read_textured_glb(run.file("export", MESH_GLB))) is None:
-            return None
+        mesh = read_mesh_glb(run.file("export", MESH_GLB))
         turned = mesh.vertices.astype(np.float64) @ own.gltf_from_exported
         move = self.world.exported_from_run @ own.exported_from_run.inverse()
         return replace(mesh, vertices=move.apply(turned).astype(np.float32))

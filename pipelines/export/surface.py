@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from ...formats.ply import MeshArrays, MeshBlocks
+from ...formats.ply import MeshArrays, MeshBlocks, normal_sums
 from ..geometry.camera import project
 from ..geometry.posed_depth import PosedDepth
 from ..system.jit import kernel
@@ -182,12 +182,12 @@ def _border(places: NDArray[np.int64], chunks: NDArray[np.int32]) -> NDArray[np.
 def _pieces(faces: NDArray[np.int32], count: int) -> NDArray[np.int32]:
     """(count,) numbers from 0 of the connected pieces, -1 for a vertex without a face."""
     number, used = np.full(count, -1, np.int32), np.unique(faces)
-    joined = _components(np.concatenate([faces[:, :2], faces[:, 1:]]), count)[used]
+    joined = components(np.concatenate([faces[:, :2], faces[:, 1:]]), count)[used]
     number[used] = np.unique(joined, return_inverse=True)[1]
     return number
 
 
-def _components(edges: NDArray[np.integer], count: int) -> NDArray[np.int32]:
+def components(edges: NDArray[np.integer], count: int) -> NDArray[np.int32]:
     """(count,) the number of the connected component of each node, by edges (E, 2)."""
     graph = coo_array((np.ones(len(edges), bool), edges.T), shape=(count, count))
     return np.asarray(connected_components(graph, directed=False)[1])
@@ -265,7 +265,7 @@ def _choose(sizes: Sequence[_Sizes], least_share: float) -> list[_Chosen]:
     numbers = (np.where(s.border < 0, -1, s.border + a) for s, a in zip(sizes, starts, strict=False))
     piece = np.concatenate([np.zeros(0, int), *numbers])
     used = piece >= 0
-    whole = _components(np.stack([piece[used], place[used] + count], 1), count + len(places))[:count]
+    whole = components(np.stack([piece[used], place[used] + count], 1), count + len(places))[:count]
     faces = np.bincount(whole, np.concatenate([np.zeros(0), *(s.faces for s in sizes)]))
     stays = np.append(faces[whole] >= least_share * faces.max(initial=0), False)
     place_stays = np.zeros(len(places), bool)
@@ -312,15 +312,6 @@ def filled(mesh: MeshArrays, views: Iterable[PosedDepth]) -> MeshArrays:
     new = new[~folded]
     new = new[_is_seen(points[new].mean(1), points, views, edge)]
     return replace(mesh, faces=np.concatenate([mesh.faces, new.astype(np.int32)]))
-
-
-def normal_sums(points: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Return (V, 3) sums of the normals of the faces around, each twice as long as the face is large."""
-    corners, total = points[faces], np.zeros_like(points)
-    of_face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    for k in range(3):
-        np.add.at(total, faces[:, k], of_face)
-    return total
 
 
 @kernel

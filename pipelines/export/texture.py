@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
-from scipy.spatial import cKDTree
 
-from ...formats.glb import TexturedMesh
-from ...formats.ply import MeshArrays
+from ...formats.glb import ClassMesh
+from ...formats.ply import MeshArrays, normal_sums
 from ..geometry.camera import resample_nearest
 from ..geometry.posed_depth import PosedDepth
 from ..run.outcome import Outcome
@@ -21,7 +20,7 @@ from ..system.progress import Progress
 from ..system.raster import draw_faces
 from ..system.threads import for_each
 from ..types import Frame, Intrinsics
-from .surface import filled, normal_sums
+from .light import areas
 
 TEXTURE_SIDE = 4096
 """A texture has at most this many pixels a side: what viewers on the web and phones take."""
@@ -37,12 +36,6 @@ _FEATHER = 0.04
 """Weights fade over this part of the image's longer side beside its rim and beside what is hidden."""
 _BAND = 64
 
-SHARE = 0.1
-"""Vertices that are kept: with a texture they need to follow the shape only."""
-_FEWEST = 4
-"""Faces that a mesh is not simplified below."""
-_SMOOTH = 5.0
-"""How readily fast-simplification goes on to worse edges (its `agg`; lower is slower and keeps the shape better)."""
 _GUTTER = 2
 """Empty texels around a chart, beyond those that bilinear sampling reaches."""
 _PART = 4000
@@ -236,14 +229,15 @@ def _filled(total: NDArray[np.float32]) -> NDArray[np.float32]:
     return total
 
 
-def make_textured(outcome: Outcome, mesh: MeshArrays, views: Sequence[PosedDepth], progress: Progress) -> TexturedMesh:
-    """Close slits, keep a tenth of the mesh's vertices, and paint an image of it from the keyframes of the `views`."""
+def textured(
+    outcome: Outcome, mesh: MeshArrays, labels: NDArray[np.uint8], views: Sequence[PosedDepth], progress: Progress
+) -> ClassMesh:
+    """The mesh with the labels (F,) of its faces and a picture painted from the keyframes of the `views`."""
     shots = _shots(outcome, views)
-    light = simplified(filled(mesh, views))
-    atlas = unwrapped(light, texels_wanted(light.vertices, light.faces, shots), TEXTURE_SIDE)
+    atlas = unwrapped(mesh, texels_wanted(mesh.vertices, mesh.faces, shots), TEXTURE_SIDE)
     texture = paint_texture(atlas, shots, progress)
     uv = (atlas.corners / (atlas.width, atlas.height)).astype(np.float32)
-    return TexturedMesh(light.vertices, light.labels, atlas.corner_vertex, uv, atlas.corner_faces, texture)
+    return ClassMesh(mesh.vertices, mesh.colors, labels, atlas.corner_vertex, uv, atlas.corner_faces, texture)
 
 
 def _shots(outcome: Outcome, views: Sequence[PosedDepth]) -> Sequence[Shot]:
@@ -264,33 +258,12 @@ def _shot(outcome: Outcome, frame: Frame, view: PosedDepth, sharpness: float) ->
     return Shot(view, outcome.calibration.intrinsics, sharpness, photo, outcome.run.left_out(frame))
 
 
-def simplified(mesh: MeshArrays, share: float = SHARE) -> MeshArrays:
-    """At most that share of the vertices (Garland and Heckbert 1997); colour and label are the nearest vertex's."""
-    from fast_simplification import simplify
-
-    most, wanted = share * len(mesh.vertices), share * len(mesh.faces)
-    if len(mesh.faces) <= _FEWEST:
-        return mesh
-    for _ in range(3):  # along open rims there are more vertices to a face than elsewhere
-        points, faces = simplify(mesh.vertices, mesh.faces, target_count=max(int(wanted), _FEWEST), agg=_SMOOTH)
-        points = points.astype(np.float32)
-        used, renumbered = np.unique(faces[_areas(points, faces) > 0], return_inverse=True)
-        if len(used) == 0:
-            return mesh  # it has no area at all
-        if len(used) <= most:
-            break
-        wanted *= 0.99 * most / len(used)
-    _, nearest = cKDTree(mesh.vertices).query(points[used])
-    faces = renumbered.reshape(-1, 3).astype(np.int32)
-    return MeshArrays(points[used], faces, mesh.colors[nearest], mesh.labels[nearest])
-
-
 def unwrapped(mesh: MeshArrays, texels_per_unit: float, most: int) -> Atlas:
     """The mesh cut into charts that lie flat beside each other, in an image of at most that many texels a side."""
     import xatlas
 
     # xatlas takes faces for nothing whose area is below 1e-7, whatever the unit: with this one they are 1 on the whole.
-    scale = np.float32(1 / np.sqrt(_areas(mesh.vertices, mesh.faces).mean().clip(1e-30)))
+    scale = np.float32(1 / np.sqrt(areas(mesh.vertices, mesh.faces).mean().clip(1e-30)))
     square = float(np.sqrt(len(mesh.faces) / _FILLED))
     packing = xatlas.PackOptions()
     packing.texels_per_unit, packing.padding = min(texels_per_unit / float(scale), 0.97 * most / square), _GUTTER
@@ -325,11 +298,6 @@ def _parts(mesh: MeshArrays) -> list[NDArray[np.int64]]:
         along = part[np.argsort(middles[part][:, np.ptp(middles[part], axis=0).argmax()], kind="stable")]
         waiting += [along[len(part) // 2 :], along[: len(part) // 2]]
     return parts
-
-
-def _areas(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> NDArray[np.float64]:
-    a, b, c = np.moveaxis(vertices[faces].astype(np.float64), 1, 0)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
 
 def owners(atlas: Atlas) -> NDArray[np.int32]:

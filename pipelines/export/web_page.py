@@ -34,7 +34,7 @@ MAX_CAMERAS = 120
 EXPORTED, RUN = "exported", "run"
 """Worlds of a camera path: that of the exported files, and that of a run without an export."""
 PARTS = Path(__file__).parent / "page"
-_SCRIPTS = ("cloud.js", "draw.js", "moves.js", "tape.js", "record.js", "page.js")
+_SCRIPTS = ("cloud.js", "draw.js", "moves.js", "look.js", "tape.js", "record.js", "page.js")
 
 
 def write_web_page(scene: ExportScene, target: Target) -> None:

@@ -17,7 +17,7 @@ from msgs_slam.pipelines.evaluation.views import label_picture, render_outcome
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.outcome import Outcome, load_outcome
 from msgs_slam.pipelines.scene.world import WORLD
-from tests.benchmarks.textured_mesh import Textured
+from tests.benchmarks.textured_mesh import Light
 
 WIDTH = 400
 """Pixels of one of the four."""
@@ -46,7 +46,7 @@ def drawn(outcome: Outcome, row: int) -> dict[str, NDArray[np.uint8]]:
     cam_from_world = outcome.trajectory.cam_from_world[row]
     view = render_outcome(outcome, cam_from_world)
     world = WORLD.read(outcome.run.file("export", "world.json"))
-    mesh = Textured(outcome.run.file("export", "mesh.glb"), world.gltf_from_exported)
+    mesh = Light(outcome.run.file("export", "mesh.glb"), world.gltf_from_exported)
     moved = outcome.moved(world.exported_from_run).trajectory.cam_from_world[row]
     color, covered = mesh.draw(moved, outcome.calibration.intrinsics)
     surface = np.where(covered[..., None], np.round(255 * color.clip(0, 1)), 255).astype(np.uint8)

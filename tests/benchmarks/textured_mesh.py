@@ -15,10 +15,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import cv2
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 
+from msgs_slam.formats.glb import read_mesh_glb
 from msgs_slam.formats.images import write_rgb
 from msgs_slam.formats.ply import read_mesh_ply
 from msgs_slam.pipelines.evaluation.metrics import psnr
@@ -50,7 +50,7 @@ def measure(root: Path, folder: Path, every: int, picture: Path | None) -> None:
     plain = read_mesh_ply(folder / "mesh.ply")
     drawers = [
         VertexColours(plain.vertices, plain.faces, plain.colors),
-        Textured(folder / "mesh.glb", world.gltf_from_exported),
+        Light(folder / "mesh.glb", world.gltf_from_exported),
     ]
     rows: dict[bool, list[tuple[float, ...]]] = {True: [], False: []}
     sheets = []
@@ -67,8 +67,8 @@ def measure(root: Path, folder: Path, every: int, picture: Path | None) -> None:
             figures = [psnr(color, photo, both) for color, _ in drawn]
             rows[bool(trajectory.is_keyframe[row])].append((*figures, *(covered.mean() for _, covered in drawn)))
         sheets.append(np.concatenate([photo, *(np.where(c[..., None], d, 0) for d, c in drawn)], axis=1))
-    textured = drawers[1]
-    print(f"{root.name}: vertices {len(plain.vertices)} / {textured.count}, texture {textured.picture.shape[:2]}")
+    light = drawers[1]
+    print(f"{root.name}: faces {len(plain.faces)} / {len(light.faces)}, texture {light.picture.shape[:2]}")
     for is_keyframe, name in ((True, "keyframes"), (False, "between")):
         if rows[is_keyframe]:
             a, b, seen, seen_textured = np.mean(rows[is_keyframe], axis=0)
@@ -124,20 +124,20 @@ class VertexColours(Drawer):
         return np.einsum("nk,nkc->nc", shares, self.colors[self.faces[face]])
 
 
-class Textured(Drawer):
-    """As trimesh reads it from the GLB."""
+class Light(Drawer):
+    """The lighter mesh, with its texture or its vertices' colours."""
 
     def __init__(self, path: Path, gltf_from_world: NDArray) -> None:
-        mesh = trimesh.load(path, process=False, force="mesh")
-        super().__init__(np.asarray(mesh.vertices) @ gltf_from_world, np.asarray(mesh.faces))
-        self.uv = np.asarray(mesh.visual.uv)
-        self.picture = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))
-        self.count = len(np.unique(self.vertices, axis=0))
+        mesh = read_mesh_glb(path)
+        super().__init__(mesh.vertices @ gltf_from_world, mesh.faces)
+        self.uv, self.picture, self.colors = mesh.corner_uv, mesh.texture, mesh.colors / np.float32(255)
 
     def colors_at(self, face: NDArray, shares: NDArray) -> NDArray:
+        if not self.picture.size:
+            return np.einsum("nk,nkc->nc", shares, self.colors[self.faces[face]])
         uv = np.einsum("nk,nkc->nc", shares, self.uv[self.faces[face]])
         height, width = self.picture.shape[:2]
-        x, y = (uv[:, 0] * width - 0.5).astype(np.float32), ((1 - uv[:, 1]) * height - 0.5).astype(np.float32)
+        x, y = (uv[:, 0] * width - 0.5).astype(np.float32), (uv[:, 1] * height - 0.5).astype(np.float32)
         out = np.empty((len(face), 3), np.float32)
         for a in range(0, len(face), 30000):  # OpenCV takes pictures of at most 32767 a side
             part = slice(a, a + 30000)

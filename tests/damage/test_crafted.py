@@ -26,7 +26,7 @@ from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.datasets.calibration import read_calibration_file, read_yaml
 from msgs_slam.formats.datasets.sequence import read_class_table, read_nyu40_classes
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.glb import read_textured_glb
+from msgs_slam.formats.glb import read_mesh_glb
 from msgs_slam.formats.gps import read_track
 from msgs_slam.formats.image_folder import read_image_times
 from msgs_slam.formats.images import write_rgb
@@ -88,10 +88,10 @@ BAD_FILES: dict[str, tuple[str, bytes, Read]] = {
         "a.ply", ply(b"element vertex 1\nelement face 0\n", b"\xff" * 16), read_mesh_ply,
     ),
     "GLB of a billion zeros": (
-        "a.glb", glb({"textures": [], "bufferViews": 5 * [{"byteOffset": 0, "byteLength": 10**9}]}), read_textured_glb,
+        "a.glb", glb({"meshes": [0], "bufferViews": 5 * [{"byteOffset": 0, "byteLength": 10**9}]}), read_mesh_glb,
     ),
     "GLB that names another file": (
-        "a.glb", glb({"textures": [], "buffers": [{"uri": "/etc/passwd"}]}), read_textured_glb,
+        "a.glb", glb({"textures": [], "meshes": [0], "buffers": [{"uri": "/etc/passwd"}]}), read_mesh_glb,
     ),
     "npz bomb": ("a.npz", npz_bomb(), load_arrays),
     "safetensors header of 2^62 bytes": ("a.safetensors", struct.pack("<Q", 1 << 62) + b"{}", load_tensors),

@@ -27,10 +27,11 @@ from msgs_slam.pipelines.evaluation.truth import associate
 from msgs_slam.pipelines.evaluation.views import depth_picture, depth_range, view_map
 from msgs_slam.pipelines.export.colmap import seen_points
 from msgs_slam.pipelines.export.floor_plan import find_walls
+from msgs_slam.pipelines.export.light import lightened, simplified
 from msgs_slam.pipelines.export.mesh import find_planes
 from msgs_slam.pipelines.export.meshes import with_floor
 from msgs_slam.pipelines.export.surface import chunk_surfaces, joined, weld
-from msgs_slam.pipelines.export.texture import simplified, texels_wanted
+from msgs_slam.pipelines.export.texture import texels_wanted
 from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
 from msgs_slam.pipelines.geometry.camera import resize_maps
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth, neighbours, overlaps
@@ -147,7 +148,8 @@ def test_rooms_of_few_voxels(count: int) -> None:
 @pytest.mark.parametrize(("vertices", "faces"), MESHES.values(), ids=MESHES)
 def test_meshes_of_nothing(vertices: np.ndarray, faces: np.ndarray) -> None:
     mesh = MeshArrays(vertices, faces, np.zeros((len(vertices), 3), np.uint8), np.zeros(len(vertices), np.uint8))
-    assert len(simplified(mesh).faces) == len(faces)
+    assert len(simplified(mesh, 1).faces) == len(faces)
+    assert len(lightened(mesh, 1)[1]) == len(faces)
     if len(vertices):
         assert len(with_floor(vertices.astype(float), faces)[1]) >= len(faces)
     assert find_walls(vertices, faces) == []

@@ -30,7 +30,7 @@ void main() {
   result = vec4(color.rgb * alpha, alpha);
 }`;
 
-function makePicture(canvas, cloud, classColors, cones) {
+function makePicture(canvas, cloud, classColors) {
   const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
   if (!gl) throw new Error("This browser has no WebGL 2, which drawing the map needs.");
   const program = gl.createProgram();
@@ -64,7 +64,7 @@ function makePicture(canvas, cloud, classColors, cones) {
   texture(1, "colors", gl.RGBA8, wide, high, gl.RGBA, gl.UNSIGNED_BYTE, filled(cloud.colors, 4));
   texture(2, "classes", gl.R8, wide, high, gl.RED, gl.UNSIGNED_BYTE, filled(cloud.classes, 1));
   texture(3, "palette", gl.RGBA8, 256, 1, gl.RGBA, gl.UNSIGNED_BYTE, palette);
-  texture(4, "cones", gl.RGBA8_SNORM, wide, high, gl.RGBA, gl.BYTE, filled(cones, 4));
+  texture(4, "cones", gl.RGBA8_SNORM, wide, high, gl.RGBA, gl.BYTE, filled(cloud.cones, 4));
 
   const attribute = (name, data, use) => {
     const buffer = gl.createBuffer(), where = gl.getAttribLocation(program, name);

@@ -7,7 +7,7 @@ const canvas = find("scene"), overlay = find("overlay"), note = find("note");
 const wanted = new URLSearchParams(location.hash.slice(1)), bare = wanted.has("bare");
 const state = { mode: wanted.get("mode") || "color", move: "orbit", measuring: false, ends: [], text: "", showPath: false, playing: 0, keyframes: [] };
 const eye = makeEye(about);
-let cloud, draw, waiting = false;
+let cloud, draw, waiting = false, zoom = 1;
 
 start().catch((error) => { find("message").textContent = `The map cannot be shown: ${error.message}`; });
 
@@ -15,9 +15,11 @@ async function start() {
   if (!window.DecompressionStream) throw new Error("this browser is too old to unpack it.");
   cloud = await unpackCloud(about, find("map").textContent);
   find("map").remove();
-  draw = makePicture(canvas, cloud, about.classes.map((c) => c.color), seenFrom(cloud, about));
+  cloud.cones = seenFrom(cloud, about);
+  draw = makePicture(canvas, cloud, about.classes.map((c) => c.color));
   find("message").textContent = "";
   find("panel").hidden = bare;
+  find("panel").classList.toggle("folded", onPhone());
   reset();
   keepOverReload(about, eye, state);
   addLegend();
@@ -30,15 +32,28 @@ async function start() {
   addEventListener("resize", again);
   const off = (camera) => Math.abs(camera.n - wanted.get("camera"));
   const nearest = about.cameras.reduce((best, camera) => (best && off(best) <= off(camera) ? best : camera), null);
-  if (wanted.has("camera") && nearest) eye.take(nearest, about.depth);
+  if (wanted.has("camera") && nearest) {
+    eye.take(nearest, about.depth);
+    zoom = 1;
+  }
   paint();
   document.documentElement.dataset.ready = "1";
 }
 
 function reset() {
-  if (about.cameras.length) eye.take(about.cameras[0], about.depth);
+  const look = firstLook(cloud, about, freeArea());
+  if (look) eye.take(look.camera, about.depth);
   else eye.look(plus(about.middle, [0, -2 * about.depth, 0.7 * about.depth]), about.middle);
+  zoom = look ? look.zoom : 1;
   again();
+}
+
+const onPhone = () => matchMedia("(max-width: 600px)").matches;
+
+// What the panel leaves of the map, in points of the screen; on a phone the two lie beside each other.
+function freeArea() {
+  const panel = find("panel"), left = bare || onPhone() || panel.classList.contains("folded") ? 0 : panel.offsetLeft + panel.offsetWidth;
+  return { left, width: canvas.clientWidth - left, height: canvas.clientHeight };
 }
 
 function again() {
@@ -49,11 +64,8 @@ function again() {
 function lens() {
   const ratio = window.devicePixelRatio || 1, width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
   for (const c of [canvas, overlay]) if (c.width !== width || c.height !== height) Object.assign(c, { width, height });
-  // The whole of a camera's image fits into the window. Where it would be a strip, as on a phone held upright, it is
-  // enlarged half of the way, by ratios, to where it would leave nothing empty.
-  const fits = [height / about.slope[1], width / about.slope[0]], whole = Math.min(...fits);
-  const focal = wanted.has("camera") || fits[0] < fits[1] ? whole : Math.sqrt(fits[0] * fits[1]);
-  return [focal, focal, width / 2 + focal * about.shift[0], height / 2 + focal * about.shift[1]];
+  const area = freeArea(), focal = ratio * zoom * focalOf(about, area), middle = ratio * (area.left + area.width / 2);
+  return [focal, focal, middle + focal * about.shift[0], height / 2 + focal * about.shift[1]];
 }
 
 function paint() {

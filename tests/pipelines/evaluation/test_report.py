@@ -15,7 +15,7 @@ from finished import note_finished
 
 from msgs_slam.formats.datasets import Dataset
 from msgs_slam.formats.errors import InputError
-from msgs_slam.formats.glb import TexturedMesh, write_textured_glb
+from msgs_slam.formats.glb import ClassMesh, write_mesh_glb
 from msgs_slam.formats.images import decode_rgb
 from msgs_slam.pipelines.evaluation.facts import Capture, advice, found_lengths, lost_stretches
 from msgs_slam.pipelines.evaluation.html import Line, page, plot, section, table, ticks
@@ -127,11 +127,11 @@ def test_the_report_shows_the_mesh_and_links_the_page_beside_it(oracle_run: Orac
     corners = np.array([[-9, -9, 3], [9, -9, 3], [9, 9, 3], [-9, 9, 3.0]]) @ first[:3, :3].T + first[:3, 3]
     corners = world.exported_from_run.apply(corners) @ world.gltf_from_exported.T
     texture = np.full((8, 8, 3), (200, 30, 120), np.uint8)
-    wall = TexturedMesh(
-        corners.astype(np.float32), np.zeros(4, np.uint8), np.arange(4), np.zeros((4, 2), np.float32),
-        np.array([[0, 1, 2], [0, 2, 3]], np.int32), texture,
+    wall = ClassMesh(
+        corners.astype(np.float32), np.zeros((4, 3), np.uint8), np.zeros(2, np.uint8), np.arange(4),
+        np.zeros((4, 2), np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.int32), texture,
     )  # fmt: skip
-    write_textured_glb(export / "mesh.glb", wall)
+    write_mesh_glb(export / "mesh.glb", wall)
     (export / "map.html").write_text("<p>map</p>")
     note_finished(run, ("frames", "proxy", "tracking", "mapping", "export"))
     html = write_report(run).read_text()

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.ply import MeshArrays
 from msgs_slam.pipelines.export import texture
+from msgs_slam.pipelines.export.light import SHARE, simplified
 from msgs_slam.pipelines.export.surface import filled
-from msgs_slam.pipelines.export.texture import Atlas, Shot, owners, paint_texture, simplified, texels_wanted, unwrapped
+from msgs_slam.pipelines.export.texture import Atlas, Shot, owners, paint_texture, texels_wanted, unwrapped
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.system.raster import draw_faces
@@ -50,7 +51,7 @@ def fine() -> MeshArrays:
 
 @pytest.fixture(scope="module")
 def atlas(fine: MeshArrays) -> Atlas:
-    light = simplified(fine)
+    light = simplified(fine, round(SHARE * len(fine.faces)))
     return unwrapped(light, texels_wanted(light.vertices, light.faces, SHOTS), 4096)
 
 
@@ -78,9 +79,9 @@ def places(atlas: Atlas) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     return inside, points[(shares >= 0).all(1)]
 
 
-def test_a_tenth_of_the_vertices_keeps_shape_and_labels(fine: MeshArrays) -> None:
-    light = simplified(fine)
-    assert 0.08 < len(light.vertices) / len(fine.vertices) <= 0.1
+def test_a_tenth_of_the_faces_keeps_shape_and_labels(fine: MeshArrays) -> None:
+    light = simplified(fine, round(SHARE * len(fine.faces)))
+    assert 0.08 < len(light.faces) / len(fine.faces) <= 0.1
     off = np.abs(np.linalg.norm(light.vertices, axis=1) - RADIUS)
     assert 0 < off.max() < 0.01 * RADIUS
     clear = np.abs(light.vertices[:, 0]) > 0.05
@@ -198,7 +199,7 @@ def test_a_mesh_without_any_area_has_a_texture_too() -> None:
     points = np.arange(21, dtype=np.float32).reshape(7, 3) * [1, 0, 0]
     faces = np.arange(5, dtype=np.int32)[:, None] + np.arange(3, dtype=np.int32)
     line = MeshArrays(points.astype(np.float32), faces, np.full((7, 3), 9, np.uint8), np.zeros(7, np.uint8))
-    flat = unwrapped(simplified(line), 100.0, 4096)
+    flat = unwrapped(simplified(line, 1), 100.0, 4096)
     assert paint_texture(flat, SHOTS[:1], SilentProgress()).shape == (flat.height, flat.width, 3)
 
 

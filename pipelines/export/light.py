@@ -1,0 +1,135 @@
+"""A lighter mesh: fewer faces, of which none reaches over the border of a class, with smooth rims.
+
+Faces are taken away by quadrics (Garland and Heckbert 1997).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ...formats.ply import MeshArrays, normal_sums
+from ..geometry.voxels import voxel_keys
+from .surface import components
+
+SHARE = 0.1
+"""Faces that are kept of a mesh with a texture: it needs to follow the shape only."""
+_FEWEST = 4
+"""Faces that a mesh is not simplified below."""
+_SMOOTH = 5.0
+"""How readily fast-simplification goes on to worse edges (its `agg`; lower is slower and keeps the shape better)."""
+_TRIES = 8
+"""How often fewer faces are asked for where rims and borders keep more than `most`."""
+_MOST = 4_000_000
+"""Faces that are simplified at once, in 0.5 GB."""
+_SPOT = 200
+"""A class has at least so many faces in a place; smaller spots become as what is around them."""
+_ROUNDS = 8
+"""How often a rim's vertices move half of the way to the middle between their neighbours."""
+
+
+def clustered(mesh: MeshArrays, most: int = _MOST) -> MeshArrays:
+    """The mesh where it has at most so many faces; else with one vertex for all in a cube of a grid."""
+    while len(mesh.faces) > most:
+        places = mesh.vertices.astype(np.float64)
+        edge = np.median(np.linalg.norm(places[mesh.faces[:, 0]] - places[mesh.faces[:, 1]], axis=1))
+        _, first, number = np.unique(voxel_keys(places, 2 * float(edge)), return_index=True, return_inverse=True)
+        mesh = _with_faces(mesh, first, number.reshape(-1)[mesh.faces])
+    return mesh
+
+
+def _with_faces(mesh: MeshArrays, rows: NDArray[np.int64], faces: NDArray[np.integer]) -> MeshArrays:
+    """These vertices of a mesh, and those of the `faces` that have three different ones."""
+    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return MeshArrays(mesh.vertices[rows], faces[whole].astype(np.int32), mesh.colors[rows], mesh.labels[rows])
+
+
+def lightened(mesh: MeshArrays, most: int) -> tuple[MeshArrays, NDArray[np.uint8]]:
+    """At most so many faces, and their labels (F,), whose borders stay where they are."""
+    labels, pairs, edges = _labels_of_faces(mesh)
+    middles = mesh.vertices[mesh.faces].mean(axis=1)
+    light = simplified(mesh, most, edges[labels[pairs[:, 0]] != labels[pairs[:, 1]]])
+    nearest = cKDTree(middles).query(light.vertices[light.faces].mean(axis=1))[1]
+    return light, labels[nearest]
+
+
+def _labels_of_faces(mesh: MeshArrays) -> tuple[NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]:
+    """(F,) what most corners of a face are, without small spots; the pairs of faces (E, 2) that share an edge, and
+    the edges (E, 2)."""
+    of_corners = mesh.labels[mesh.faces]
+    labels = np.where(of_corners[:, 1] == of_corners[:, 2], of_corners[:, 1], of_corners[:, 0])
+    edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).astype(np.int64)
+    order = np.argsort(edges[:, 0] * len(mesh.vertices) + edges[:, 1], kind="stable")
+    same = (edges[order[1:]] == edges[order[:-1]]).all(axis=1)
+    pairs = np.stack([order[:-1][same], order[1:][same]], 1) // 3
+    for least in (_SPOT // 20, _SPOT // 4, _SPOT):
+        at_border = labels[pairs[:, 0]] != labels[pairs[:, 1]]
+        spot = components(pairs[~at_border], len(labels))
+        is_small = np.bincount(spot) < least
+        votes = np.zeros((len(is_small), 256), np.int32)
+        for a, b in (pairs[at_border].T, pairs[at_border][:, ::-1].T):
+            counts = ~is_small[spot[b]]
+            np.add.at(votes, (spot[a][counts], labels[b][counts]), 1)
+        changed = is_small & (votes.max(axis=1) > 0)
+        labels = np.where(changed[spot], votes.argmax(axis=1).astype(np.uint8)[spot], labels)
+    return labels, pairs, edges[order[:-1][same]]
+
+
+def smoothed_rims(mesh: MeshArrays) -> MeshArrays:
+    """The mesh with its open edges in smooth lines in place of the steps of voxels."""
+    edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    rims, count = np.unique(edges, axis=0, return_counts=True)
+    rims, places = rims[count == 1], mesh.vertices.astype(np.float64)
+    both = np.concatenate([rims, rims[:, ::-1]])
+    degree = np.bincount(both[:, 0], minlength=len(places))
+    inside = np.flatnonzero(degree == 2)
+    for _ in range(_ROUNDS):
+        total = np.stack([np.bincount(both[:, 0], places[both[:, 1], k], len(places)) for k in range(3)], 1)
+        places[inside] = places[inside] / 2 + total[inside] / 4
+    return MeshArrays(places.astype(np.float32), mesh.faces, mesh.colors, mesh.labels)
+
+
+def simplified(mesh: MeshArrays, most: int, kept: NDArray[np.int64] | None = None) -> MeshArrays:
+    """At most so many faces; colour and label are the nearest vertex's. Edges (E, 2) that are `kept` become longer and
+    stay in their lines: each has a face upright on it meanwhile, and the quadric of that face."""
+    from fast_simplification import simplify
+
+    if len(mesh.faces) <= max(most, _FEWEST):
+        return mesh
+    fins, faces = np.zeros((0, 3), np.float32), mesh.faces
+    if kept is not None and len(kept):
+        fins = _above(mesh, kept)
+        upright = np.column_stack([kept, len(mesh.vertices) + np.arange(len(kept))])
+        faces = np.concatenate([faces, upright.astype(np.int32)])
+    points, tree = np.concatenate([mesh.vertices, fins]), cKDTree(np.concatenate([mesh.vertices, fins]))
+    wanted = float(most)
+    for number in range(_TRIES):
+        if number == _TRIES // 2:
+            faces = mesh.faces  # too much is kept
+        found, made = simplify(points, faces, target_count=max(int(wanted), _FEWEST), agg=_SMOOTH)
+        found = found.astype(np.float32)
+        nearest = tree.query(found)[1]
+        made = made[(areas(found, made) > 0) & (nearest[made] < len(mesh.vertices)).all(axis=1)]
+        if len(made) <= most:
+            break
+        wanted *= 0.97 * most / len(made)
+    if not len(made):
+        return mesh  # it has no area at all
+    used, faces = np.unique(made, return_inverse=True)
+    rows = nearest[used]
+    return MeshArrays(found[used], faces.reshape(-1, 3).astype(np.int32), mesh.colors[rows], mesh.labels[rows])
+
+
+def _above(mesh: MeshArrays, edges: NDArray[np.int64]) -> NDArray[np.float32]:
+    """(E, 3) a place over the middle of each edge, as high as the edge is long."""
+    places = mesh.vertices.astype(np.float64)
+    first, second = places[edges[:, 0]], places[edges[:, 1]]
+    normals = normal_sums(places, mesh.faces)[edges].sum(axis=1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    high = np.linalg.norm(second - first, axis=1, keepdims=True)
+    return ((first + second) / 2 + high * normals).astype(np.float32)
+
+
+def areas(vertices: NDArray[np.float32], faces: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Return the areas (F,) of triangles."""
+    a, b, c = np.moveaxis(vertices[faces].astype(np.float64), 1, 0)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
