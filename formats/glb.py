@@ -28,7 +28,7 @@ _LINEAR, _MIPMAPPED, _CLAMPED = 9729, 9987, 33071
 UNLIT = "KHR_materials_unlit"
 LABEL = "_LABEL"
 """Attribute of the class numbers."""
-_UNNAMED = "unknown"
+_UNNAMED, _HIDDEN = "unknown", "hidden"
 
 
 def material(unlit: bool = True, **more: Any) -> dict[str, Any]:
@@ -168,8 +168,8 @@ def write_glb(path: Path, document: dict[str, Any], parts: Sequence[Part], rest:
 
 @dataclass(frozen=True, eq=False)
 class ClassMesh:
-    """vertices (V, 3) float32 with colors (V, 3) uint8; labels (F,) uint8 of the faces (255 = no class); texture
-    (H, W, 3) uint8, without pixels for the vertices' colours in its place.
+    """vertices (V, 3) float32 with colors (V, 3) uint8; labels (F,) uint8 of the faces (255 = no class), and
+    which of them are `hidden`, seen by no keyframe; texture (H, W, 3) uint8, without pixels for the vertices' colours.
 
     corner_vertex (K,) int64 and corner_uv (K, 2) float32: a vertex has as many corners as charts meet there; u to the
     right and v downwards from the texture's top left, 0..1. faces (F, 3) int32 are corners.
@@ -182,6 +182,7 @@ class ClassMesh:
     corner_uv: NDArray[np.float32]
     faces: NDArray[np.int32]
     texture: NDArray[np.uint8]
+    hidden: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         v, k, f = len(self.vertices), len(self.corner_vertex), len(self.faces)
@@ -204,15 +205,17 @@ class ClassMesh:
 
 
 def write_mesh_glb(path: Path, mesh: ClassMesh, class_names: tuple[str, ...] = ()) -> None:
-    """Write a GLB with a node for each class, named after it, its number as attribute _LABEL; shown as it is
-    (KHR_materials_unlit), with the texture as a JPEG or with vertex colours.
+    """Write a GLB with a node for each class, named after it, its number as attribute _LABEL, and another one for what
+    of it is hidden; shown as it is (KHR_materials_unlit), with the texture as a JPEG or with vertex colours.
 
     glTF wants y up: the caller turns the vertices. The same mesh gives the same bytes. Raises InputError when the disk
     refuses.
     """
     normals, nodes = mesh.normals, []
-    for label in np.unique(mesh.labels).tolist():
-        corners, faces = np.unique(mesh.faces[mesh.labels == label], return_inverse=True)
+    kinds = mesh.labels if mesh.hidden is None else mesh.labels + 256 * mesh.hidden.astype(np.int64)
+    for kind in np.unique(kinds).tolist():
+        label, name = kind % 256, class_names[kind % 256] if kind % 256 < len(class_names) else _UNNAMED
+        corners, faces = np.unique(mesh.faces[kinds == kind], return_inverse=True)
         vertex = mesh.corner_vertex[corners]
         shown = Part.of("TEXCOORD_0", mesh.corner_uv[corners])
         if not mesh.texture.size:
@@ -225,7 +228,7 @@ def write_mesh_glb(path: Path, mesh: ClassMesh, class_names: tuple[str, ...] = (
             Part.of(LABEL, np.full(len(corners), label, np.float32)),
             Part.of("", faces.reshape(-1).astype(np.uint32)),
         ]
-        nodes.append(({"name": class_names[label] if label < len(class_names) else _UNNAMED}, parts))
+        nodes.append(({"name": name if kind == label else f"{name}, {_HIDDEN}"}, parts))
     if not mesh.texture.size:
         write_primitives(path, nodes, {"material": 0}, class_names, {"materials": [material()]}, [UNLIT])
         return

@@ -252,6 +252,9 @@ class ExportConfig:
         "flatten floors, walls and fronts of the mesh: parts that no match confirms are moved onto "
         "the neighbouring planes",
     )
+    complete: bool = setting(
+        True, "the mesh's planes go on behind what hides them, up to what is seen of them; marked in mesh.glb"
+    )
     image_side: int = setting(
         1600,
         "pixels on the long side of images/, read again from the source: at most its own, at least the frames'",
@@ -264,9 +267,7 @@ class ExportConfig:
         ("auto", "free"),
         option=Option("scale"),
     )  # fmt: skip
-    texture: bool = setting(
-        True, "texture mesh.glb from the keyframes; false: colours of its vertices", draft=False
-    )
+    texture: bool = setting(True, "texture mesh.glb from the keyframes; false: colours of its vertices", draft=False)
     triangles: int = setting(
         500_000, "triangles of mesh.glb at most", within=(100, 10_000_000), draft=150_000, best=1_500_000
     )

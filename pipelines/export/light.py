@@ -114,9 +114,9 @@ def simplified(mesh: MeshArrays, most: int, kept: NDArray[np.int64] | None = Non
         wanted *= 0.97 * most / len(made)
     if not len(made):
         return mesh  # it has no area at all
-    used, faces = np.unique(made, return_inverse=True)
+    used, renumbered = np.unique(made, return_inverse=True)
     rows = nearest[used]
-    return MeshArrays(found[used], faces.reshape(-1, 3).astype(np.int32), mesh.colors[rows], mesh.labels[rows])
+    return MeshArrays(found[used], renumbered.reshape(-1, 3).astype(np.int32), mesh.colors[rows], mesh.labels[rows])
 
 
 def _above(mesh: MeshArrays, edges: NDArray[np.int64]) -> NDArray[np.float32]:

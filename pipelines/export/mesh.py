@@ -1,12 +1,11 @@
 """The labelled mesh: rendered median depth of the keyframes, fused, extracted, painted.
 
 Each step is a task over chunks of keyframes or of regions, and leaves files in the stage's snapshot. Before the depths
-are fused, uncertain ones move onto the planes of sure ones beside them (`snap_to_planes`). Planes are found by random
-hypotheses, largest first, and fitted again to what lies on them (RANSAC, Fischler and Bolles 1981).
+are fused, uncertain ones move onto the planes of sure ones beside them, which go on behind furniture (`planes.py`).
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +14,21 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ...formats.glb import ClassMesh, write_mesh_glb
-from ...formats.ply import mesh_blocks, read_mesh_ply, write_mesh_ply
+from ...formats.ply import MeshArrays, mesh_blocks, read_mesh_ply, write_mesh_ply
 from ..config import ExportConfig
-from ..geometry.camera import resample_nearest, unproject_depth
+from ..geometry.camera import resample_nearest
 from ..geometry.posed_depth import PosedDepth
-from ..geometry.voxels import VOXELS_PER_DEPTH, Voxels, find, gather_depths, neighbour_keys, normals_in_cam, voxel_keys
 from ..mapping.measure import DepthViews, MeshView, mesh_view
-from ..run.outcome import Outcome, load_outcome, maps_around, spread_sample
+from ..run.outcome import Outcome, load_outcome, maps_around
 from ..run.stages import Chunk, StageContext, in_chunks
 from ..run.target import Target
 from ..system.parallel import LruSequence, map_lookahead
 from ..system.progress import Progress
 from ..system.threads import get_threads, host_threads
 from ..system.values import load_value, save_value
-from ..types import VOID, Array
+from ..types import VOID
 from .light import SHARE, clustered, lightened, smoothed_rims
+from .planes import Planes, planes_of, put_planes, snap_to_planes
 from .scene import ExportScene
 from .surface import Region, chunk_surfaces, closed, filled, joined, weld
 from .texture import textured
@@ -43,37 +42,9 @@ MAX_BLOCKS, LONG = 80_000, 200
 """Blocks of 8 x 8 x 8 voxels for so many keyframes, more for more; voxels grow where that is too few."""
 SURE = 0.5
 """Confidence of a proxy's depth from which the depth drawn there stays where it is."""
+_BEFORE = 0.05
+"""A face is hidden behind what is nearer by this part."""
 _KEPT_BYTES = 100e6
-_SIDE = 200
-_COMPARED = 24
-"""Views whose median depth sets the size of a voxel."""
-_STRETCH = 1.4
-"""A depth changes by no larger factor: a plane seen from the side is far away a little beside."""
-
-_MAX_PLANES, _MIN_SHARE, _MIN_VOXELS = 20, 0.01, 30
-"""Planes, and the share of the sure surface and the voxels that each has at least."""
-_HYPOTHESES, _COUNTED = 200, 20_000
-"""Planes through a voxel that are tried for each that is found, and voxels by which they are compared."""
-_THICK, _TAKEN = 0.7, 2.0
-"""Voxels from a plane: up to the first a voxel lies on it, up to the second it is in no further plane."""
-_ALONG, ROUGHLY_ALONG = 0.94, 0.8
-"""Cosine between the normals of a plane and of a voxel that lies on it, and of a pixel that moves onto it."""
-REACH = 3.0
-"""Voxels that a depth moves at most, across the plane."""
-NEAR, _AGREE = 8, 0.25
-"""A plane is believed in cubes of so many voxels where it has this share of all that lies within reach and along it,
-and in those without any that touch them: not where a sure surface bends away from it or has a step."""
-
-
-@dataclass(frozen=True)
-class Planes:
-    """normal (P, 3) unit vectors towards the cameras; offset (P,) = normal @ point; `cubes`, of each the sorted keys of
-    the cubes of side `NEAR * voxel` where it is believed."""
-
-    voxel: float
-    normal: Array
-    offset: Array
-    cubes: Sequence[NDArray[np.int64]]
 
 
 def write_mesh(scene: ExportScene, target: Target) -> None:
@@ -90,13 +61,15 @@ def write_mesh(scene: ExportScene, target: Target) -> None:
     if ply.exists() and glb.exists():
         return
     in_chunks(context, draw_keyframes, count, move=outcome.move)
-    if settings.planes:
-        in_chunks(context, snap_views, count, planes=planes_in(scratch, count))
+    planes = planes_in(scratch, count) if settings.planes else None
+    if planes is not None:
+        in_chunks(context, snap_views, count, planes=planes)
+    planes = planes if settings.complete else None
     views = mesh_views(scratch, count)
     if not ply.exists():
-        grid = _grid_around(views, settings)
+        grid = _grid_around(views, settings, planes)
         regions, class_ids = len(list(grid.regions())), tuple(outcome.label_of_channel.tolist())
-        in_chunks(context, fuse_views, regions, grid=grid, views=count, class_ids=class_ids)
+        in_chunks(context, fuse_views, regions, grid=grid, views=count, class_ids=class_ids, planes=planes)
         # Regions are loaded one at a time, whenever `joined` goes over them.
         write_mesh_ply(ply, joined(lambda: (load_value(_region_file(scratch, n)) for n in range(regions))), names)
     if not (mesh := read_mesh_ply(ply)).faces.size:
@@ -110,7 +83,19 @@ def write_mesh(scene: ExportScene, target: Target) -> None:
     else:
         uv, nothing = np.zeros((len(light.vertices), 2), np.float32), np.zeros((0, 0, 3), np.uint8)
         made = ClassMesh(light.vertices, light.colors, labels, np.arange(len(uv)), uv, light.faces, nothing)
+    made = replace(made, hidden=_is_hidden(light, shown))
     write_mesh_glb(glb, replace(made, vertices=(made.vertices @ axes.T).astype(np.float32)), names)
+
+
+def _is_hidden(mesh: MeshArrays, views: Iterable[PosedDepth]) -> NDArray[np.bool_]:
+    """(F,) whether no view sees a face's middle."""
+    middles, hidden = mesh.vertices[mesh.faces].mean(axis=1).astype(np.float64), np.ones(len(mesh.faces), bool)
+    for view in views:
+        xy, z, inside = view.seen(middles)
+        rows = np.flatnonzero(inside & hidden)
+        column, row = xy[rows].astype(int).T
+        hidden[rows[view.depth[row, column] > (1 - _BEFORE) * z[rows]]] = False
+    return hidden
 
 
 def _scratch(context: StageContext) -> Path:
@@ -174,13 +159,14 @@ def _view_file(scratch: Path, number: int) -> Path:
     return scratch / f"view_{number:06d}.npz"
 
 
-def _grid_around(views: Sequence[MeshView], settings: ExportConfig) -> Grid:
-    """The voxel grid around what the views show, by their median depth."""
+def _grid_around(views: Sequence[MeshView], settings: ExportConfig, planes: Planes | None) -> Grid:
+    """The voxel grid around what the views show, by their median depth, and where planes go on."""
     shown = DepthViews(views)
     step = 16 * -(-len(shown) // LONG)
     seen = np.concatenate([v.depth[v.trust > 0][::step] for v in shown])
     median = float(np.median(seen)) if len(seen) else 1.0
-    return make_grid(shown, settings.voxel * median, TRUNCATION, int(MAX_BLOCKS * max(len(views) / LONG, 1)))
+    most = int(MAX_BLOCKS * max(len(views) / LONG, 1))
+    return make_grid(shown, settings.voxel * median, TRUNCATION, most, *[planes.points] if planes else [])
 
 
 def fuse_views(task: Chunk, progress: Progress) -> None:
@@ -191,7 +177,7 @@ def fuse_views(task: Chunk, progress: Progress) -> None:
     for number in task.numbers:
         if not (file := _region_file(scratch, number)).exists():
             of = f", {number + 1} of {len(parts)}" if len(parts) > 1 else ""
-            save_value(file, _region(views, grid, known["class_ids"], parts[number], progress, of))
+            save_value(file, _region(views, grid, known["class_ids"], parts[number], progress, of, known["planes"]))
 
 
 def _region_file(scratch: Path, number: int) -> Path:
@@ -205,11 +191,16 @@ def _region(
     chunks: NDArray[np.int32],
     progress: Progress,
     of: str,
+    planes: Planes | None,
 ) -> Region:
-    """One of the regions of the grid, from the views that see it; `of` names it for the progress."""
+    """One of the regions of the grid, from the views that see it and planes that go on; `of` names it for the
+    progress."""
     near = grid.views_of(chunks)
     fusing = (views[n].shown for n in progress.track(near, "fusing" + of, len(near)))
-    triangles = chunk_surfaces(fuse(grid, chunks, fusing), chunks, MIN_WEIGHT)
+    volume = fuse(grid, chunks, fusing)
+    if planes is not None:
+        put_planes(volume, planes, grid.truncation, MIN_WEIGHT)
+    triangles = chunk_surfaces(volume, chunks, MIN_WEIGHT)
     surface = closed(weld(triangles, chunks, grid.voxel), (views[n].shown for n in near), BEHIND * grid.truncation)
     painting = (views[n] for n in progress.track(near, "painting" + of, len(near)))
     return Region(surface, *paint(surface.vertices, painting, class_ids, 2 * grid.truncation))
@@ -262,113 +253,3 @@ def _seen(
     close = np.abs(view.depth[place[:, 1], place[:, 0]] - z[inside]) < tolerance
     close &= view.trust[place[:, 1], place[:, 0]] > 0
     return inside[close], (place[close, 1], place[close, 0])
-
-
-def find_planes(voxels: Voxels) -> Planes:
-    """The largest planes of a surface; the same ones every time."""
-    rng, left, total = np.random.default_rng(0), np.ones(len(voxels), bool), voxels.weight.sum()
-    normals, offsets, cubes = [], [], []
-    for _ in range(_MAX_PLANES):
-        if left.sum() < _MIN_VOXELS:
-            break
-        on = _largest(voxels, np.flatnonzero(left), rng)
-        if voxels.weight[on].sum() < _MIN_SHARE * total or len(on) < _MIN_VOXELS:
-            break
-        normal, offset, on = _fitted(voxels, left, on)
-        left &= ~_on(voxels, normal, offset, _TAKEN, ROUGHLY_ALONG)
-        left[on] = False
-        if len(on) >= _MIN_VOXELS:
-            normals.append(normal)
-            offsets.append(offset)
-            cubes.append(_believed(voxels, normal, offset, on))
-    return Planes(float(voxels.size), np.array(normals).reshape(-1, 3), np.array(offsets), cubes)
-
-
-def _largest(voxels: Voxels, left: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
-    """The voxels on the best of some planes through a voxel; voxels are drawn by their weight."""
-    share = voxels.weight[left] / voxels.weight[left].sum()
-    tried = rng.choice(left, min(_HYPOTHESES, len(left)), replace=False, p=share)
-    seen = left if len(left) <= _COUNTED else rng.choice(left, _COUNTED, replace=False)
-    normal = voxels.normal[tried]
-    offset = (voxels.position[tried] * normal).sum(1)
-    on = np.abs(voxels.position[seen] @ normal.T - offset) < _THICK * voxels.size
-    on &= voxels.normal[seen] @ normal.T > _ALONG
-    best = int((voxels.weight[seen] @ on).argmax())
-    return left[_on(voxels, normal[best], offset[best], _THICK, _ALONG)[left]]
-
-
-def _fitted(voxels: Voxels, left: NDArray[np.bool_], on: NDArray[np.int64]) -> tuple[Array, float, NDArray[np.int64]]:
-    """Normal, offset and voxels of the plane through the middle of the voxels `on`, and of those that it then has."""
-    for _ in range(3):
-        weight = voxels.weight[on]
-        middle = np.average(voxels.position[on], 0, weight)
-        apart = voxels.position[on] - middle
-        normal = np.linalg.eigh((apart * weight[:, None]).T @ apart)[1][:, 0]
-        normal = normal * (1 if (voxels.normal[on] @ normal).sum() > 0 else -1)
-        offset = float(middle @ normal)
-        on = np.flatnonzero(left & _on(voxels, normal, offset, _THICK, _ALONG))
-        if len(on) < _MIN_VOXELS:
-            break
-    return normal, offset, on
-
-
-def _believed(voxels: Voxels, normal: Array, offset: float, on: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Sorted keys of the cubes where what lies `on` the plane is not outweighed."""
-    near = _on(voxels, normal, offset, REACH, ROUGHLY_ALONG)
-    near[on] = True
-    keys, place = np.unique(voxel_keys(voxels.position[near], NEAR * voxels.size), return_inverse=True)
-    weight = voxels.weight[near]
-    agrees = np.bincount(place, weight * np.isin(np.flatnonzero(near), on)) >= _AGREE * np.bincount(place, weight)
-    return np.setdiff1d(neighbour_keys(keys[agrees]), keys[~agrees])
-
-
-def _on(voxels: Voxels, normal: Array, offset: float, within: float, along: float) -> NDArray[np.bool_]:
-    close = np.abs(voxels.position @ normal - offset) < within * voxels.size
-    return np.asarray(close & (voxels.normal @ normal > along))
-
-
-def planes_of(views: Sequence[MeshView]) -> Planes:
-    """The planes of what the views surely show."""
-    some = (views[n].shown for n in spread_sample(range(len(views)), _COMPARED))
-    seen = [float(np.median(v.depth[v.trust > 0])) for v in some if (v.trust > 0).any()]
-    size = float(np.median(seen)) / VOXELS_PER_DEPTH if seen else 1.0
-    return find_planes(gather_depths((_sure_part(view) for view in views), size))
-
-
-def _sure_part(view: MeshView) -> PosedDepth:
-    shown, small = view.shown, view.shown.intrinsics.at_most(_SIDE)
-    trust = shown.trust if view.unsure is None else np.where(view.unsure, 0, shown.trust).astype(np.float32)
-    depth, trust = (resample_nearest(x, small.height, small.width) for x in (shown.depth, trust))
-    return PosedDepth(small, shown.cam_from_world, depth, trust)
-
-
-def snap_to_planes(view: MeshView, planes: Planes) -> MeshView:
-    """Put its uncertain depths on the nearest plane that they lie along, along their rays; `unsure` is None then."""
-    if view.unsure is None:
-        return view
-    shown = view.shown
-    pixels = np.flatnonzero(view.unsure & (shown.depth > 0) & (shown.trust > 0))
-    world_from_cam = np.linalg.inv(shown.cam_from_world)
-    rays = unproject_depth(shown.depth, shown.intrinsics).reshape(-1, 3)[pixels] @ world_from_cam[:3, :3].T
-    normals = _normals(shown).reshape(-1, 3)[pixels] @ world_from_cam[:3, :3].T
-    factor, moved = np.ones(len(pixels)), np.full(len(pixels), REACH * planes.voxel)
-    eye = world_from_cam[:3, 3]
-    for normal, offset, cubes in zip(planes.normal, planes.offset, planes.cubes, strict=True):
-        height, along = float(normal @ eye - offset), rays @ normal
-        off = np.abs(height + along)
-        fits = np.flatnonzero((off < moved) & (normals @ normal > ROUGHLY_ALONG) & (along < 0) & (height > 0))
-        to = -height / along[fits]
-        keys = voxel_keys(eye + to[:, None] * rays[fits], NEAR * planes.voxel)
-        good = (np.maximum(to, 1 / to) < _STRETCH) & (find(cubes, keys) >= 0)
-        factor[fits[good]], moved[fits[good]] = to[good], off[fits[good]]
-    depth = shown.depth.copy()
-    depth.ravel()[pixels] *= factor.astype(np.float32)
-    return replace(view, shown=replace(shown, depth=depth), unsure=None)
-
-
-def _normals(shown: PosedDepth) -> NDArray[np.float64]:
-    """(H, W, 3) in the camera, over some pixels: a depth's noise tilts those between neighbours."""
-    camera = shown.intrinsics
-    small = camera.at_most(_SIDE)
-    coarse = normals_in_cam(resample_nearest(shown.depth, small.height, small.width), small)
-    return resample_nearest(coarse, camera.height, camera.width)

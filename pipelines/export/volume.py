@@ -7,7 +7,7 @@ time does not grow with the recording.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,23 +104,35 @@ class Grid:
         ]
 
 
-def make_grid(views: Sequence[PosedDepth], voxel: float, truncation_voxels: float, max_blocks: int) -> Grid:
-    """The blocks that are needed; the voxels grow until they are at most `max_blocks`."""
+Around = Callable[[float], NDArray[np.float64]]
+
+
+def _nothing(_: float) -> NDArray[np.float64]:
+    return np.zeros((0, 3))
+
+
+def make_grid(
+    views: Sequence[PosedDepth], voxel: float, truncation_voxels: float, max_blocks: int, more: Around = _nothing
+) -> Grid:
+    """The blocks that are needed, also for the points (N, 3) that `more` has for a truncation; the voxels grow until
+    they are at most `max_blocks`."""
     frusta = [Frustum.of(view) for view in views]
-    blocks = touched_blocks(views, voxel, voxel * truncation_voxels)
+    blocks = touched_blocks(views, voxel, voxel * truncation_voxels, more)
     while len(blocks) > max_blocks:
         voxel *= 1.25
-        blocks = touched_blocks(views, voxel, voxel * truncation_voxels)
+        blocks = touched_blocks(views, voxel, voxel * truncation_voxels, more)
     return Grid(voxel, voxel * truncation_voxels, blocks, frusta)
 
 
-def touched_blocks(views: Iterable[PosedDepth], voxel: float, truncation: float) -> NDArray[np.int32]:
+def touched_blocks(
+    views: Iterable[PosedDepth], voxel: float, truncation: float, more: Around = _nothing
+) -> NDArray[np.int32]:
     """(B, 3) coordinates of the blocks within the truncation of a seen surface, or hinted at behind it, sorted.
 
     Those further than a million blocks from the origin are left out.
     """
     # One number a block: rows of three are sorted ten times as slowly. Sorted in with the others once they are as many.
-    found, waiting = np.zeros(0, np.int64), [np.zeros(0, np.int64)]
+    found, waiting = np.zeros(0, np.int64), [np.unique(voxel_keys(more(truncation), voxel * SIDE))]
     for view in views:
         world_from_cam = np.linalg.inv(view.cam_from_world)
         points = unproject_depth(view.depth, view.intrinsics)[::3, ::3]

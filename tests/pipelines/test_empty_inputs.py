@@ -28,8 +28,8 @@ from msgs_slam.pipelines.evaluation.views import depth_picture, depth_range, vie
 from msgs_slam.pipelines.export.colmap import seen_points
 from msgs_slam.pipelines.export.floor_plan import find_walls
 from msgs_slam.pipelines.export.light import lightened, simplified
-from msgs_slam.pipelines.export.mesh import find_planes
 from msgs_slam.pipelines.export.meshes import with_floor
+from msgs_slam.pipelines.export.planes import find_planes
 from msgs_slam.pipelines.export.surface import chunk_surfaces, joined, weld
 from msgs_slam.pipelines.export.texture import texels_wanted
 from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid

@@ -9,17 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from msgs_slam.pipelines.config import Config, ExportConfig
-from msgs_slam.pipelines.export.mesh import (
-    Planes,
-    draw_keyframes,
-    find_planes,
-    keyframe_rows,
-    mesh_views,
-    planes_in,
-    planes_of,
-    snap_to_planes,
-    snap_views,
-)
+from msgs_slam.pipelines.export.mesh import draw_keyframes, keyframe_rows, mesh_views, planes_in, snap_views
+from msgs_slam.pipelines.export.planes import Planes, find_planes, planes_of, put_planes, snap_to_planes
+from msgs_slam.pipelines.export.surface import chunk_surfaces, weld
+from msgs_slam.pipelines.export.volume import CHUNK, fuse, make_grid
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.geometry.voxels import Voxels
 from msgs_slam.pipelines.mapping.measure import MeshView
@@ -142,3 +135,34 @@ def test_views_of_a_run_are_made_straight_once(oracle_run: OracleRun, tmp_path: 
         found.append({path: path.read_bytes() for path in scratch.glob("*.npz")})
     assert all(v.unsure is None for v in mesh_views(scratch, count))
     assert found[0] == found[1]
+
+
+def test_the_floor_goes_on_under_what_hides_it_and_not_beyond_what_is_seen() -> None:
+    """Behind a box on the floor, which is seen on both sides and in front of it; a wall closes the room."""
+    low = 0.5
+    box = (np.abs(RAYS[..., 0] * 2) < 0.3) & (RAYS[..., 1] * 2 > 0.25) & (RAYS[..., 1] * 2 < low)
+    depth = np.where(box, 2.0, np.minimum(WALL, low / np.maximum(RAYS[..., 1], 1e-9)))
+    seen = views(depth, np.zeros_like(MIDDLE))
+    planes = planes_of(seen)
+    floor = int(np.argmin(planes.normal[:, 1]))
+
+    def goes_on(x: float, z: float) -> bool:
+        return bool(np.isin(planes.keys(floor, np.array([[x, low, z]])), planes.squares[floor])[0])
+
+    assert goes_on(0.0, 2.5)  # behind the box, where no view sees it
+    assert not goes_on(0.0, 3.6)  # behind the wall
+    assert not goes_on(2.5, 2.6)  # beside all views
+    shown = [view.shown for view in seen]
+    found = []
+    for more in ((), (planes.points,)):
+        grid = make_grid(shown, VOXEL / 2, 3.0, 100_000, *more)
+        chunks = np.unique(grid.blocks // CHUNK, axis=0)
+        volume = fuse(grid, chunks, shown)
+        if more:
+            put_planes(volume, planes, grid.truncation, 0.5)
+        points = weld(chunk_surfaces(volume, chunks, 0.5), chunks, grid.voxel).vertices
+        under = (np.abs(points[:, 0]) < 0.2) & (np.abs(points[:, 2] - 2.5) < 0.15) & (points[:, 1] > 0.4)
+        found.append(points[under])
+    assert len(found[0]) == 0
+    assert len(found[1]) > 20
+    np.testing.assert_allclose(found[1][:, 1], low, atol=0.2 * VOXEL)
