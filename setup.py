@@ -7,11 +7,10 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 ROOMS = ("formats", "msgs_cli", "pipelines")
-has_links = all(Path("msgs_slam", room).is_dir() for room in ROOMS)
-inner = find_packages(".", include=[f"{room}{below}" for room in ROOMS for below in ("", ".*")])
-
-setup(
-    packages=["msgs_slam", *(f"msgs_slam.{name}" for name in inner)],
-    # A path alone where it can be: of it an editable install is made that editors read too.
-    package_dir={"": "."} | ({} if has_links else {f"msgs_slam.{room}": room for room in ROOMS}),
-)
+if all(Path("msgs_slam", room).is_dir() for room in ROOMS):  # links, or the copies of a source distribution
+    # A path alone: of it an editable install is made that editors read too.
+    setup(packages=find_packages(".", include=["msgs_slam", "msgs_slam.*"]), package_dir={"": "."})
+else:
+    inner = find_packages(".", include=[f"{room}{below}" for room in ROOMS for below in ("", ".*")])
+    places = {"": "."} | {f"msgs_slam.{room}": room for room in ROOMS}
+    setup(packages=["msgs_slam", *(f"msgs_slam.{name}" for name in inner)], package_dir=places)
