@@ -101,7 +101,7 @@ def run_recordings(names: list[str], work: Path) -> list[str]:
             write_video(source, truth / "rgb", REAL[name])
         run = RunFolder(work / f"{name}.msgs")
         reconstruct(source, run, load_config(), SilentProgress(), "proxy")
-        pairs.append(f"{run.path}={truth}")
+        pairs.append(f"{run.root}={truth}")
     return pairs
 
 
