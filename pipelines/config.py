@@ -247,13 +247,11 @@ class ExportConfig:
     voxel: float = setting(
         0.008, "voxel of the mesh, in units of the scene's median depth", within=(0.0005, 1), draft=0.014
     )
-    planes: bool = setting(
-        True,
-        "flatten floors, walls and fronts of the mesh: parts that no match confirms are moved onto "
-        "the neighbouring planes",
-    )
-    complete: bool = setting(
-        True, "the mesh's planes go on behind what hides them, up to what is seen of them; marked in mesh.glb"
+    planes: str = setting(
+        "complete",
+        "floors, walls and fronts of the mesh: straight moves what no match confirms onto the planes around it; "
+        "complete continues these, too, behind what hides them, marked in mesh.glb; off leaves all as it is",
+        ("complete", "straight", "off"),
     )
     image_side: int = setting(
         1600,

@@ -61,10 +61,10 @@ def write_mesh(scene: ExportScene, target: Target) -> None:
     if ply.exists() and glb.exists():
         return
     in_chunks(context, draw_keyframes, count, move=outcome.move)
-    planes = planes_in(scratch, count) if settings.planes else None
+    planes = None if settings.planes == "off" else planes_in(scratch, count)
     if planes is not None:
         in_chunks(context, snap_views, count, planes=planes)
-    planes = planes if settings.complete else None
+    planes = planes if settings.planes == "complete" else None
     views = mesh_views(scratch, count)
     if not ply.exists():
         grid = _grid_around(views, settings, planes)
@@ -119,7 +119,7 @@ def draw_keyframes(task: Chunk, progress: Progress) -> None:
             row = rows[number]
             frame_id = int(t.frame_ids[row])
             view = mesh_view(near(frame_id), t.cam_from_world[row], camera)
-            if settings.planes and (maps := outcome.run.find_proxy(frame_id)) is not None:
+            if settings.planes != "off" and (maps := outcome.run.find_proxy(frame_id)) is not None:
                 view = replace(view, unsure=resample_nearest(maps.confidence, camera.height, camera.width) < SURE)
             save_value(file, view)
 

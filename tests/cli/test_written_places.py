@@ -34,7 +34,7 @@ def test_nothing_is_written_elsewhere(
     environment = elsewhere(tmp_path)
     source = files_below(finished_run.truth, finished_run.video.parent)
     commands: list[list[object]] = [
-        ["resume", run, "--set", "export.planes=false", "-q"],
+        ["resume", run, "--set", "export.planes=off", "-q"],
         ["status", run],
         ["export", run, "--to", asked / "export", "-q"],
         ["render", run, asked / "walk.mp4", "--fps", "2", "-q"],

@@ -29,7 +29,7 @@ SMALL = (
 )  # fmt: skip
 FILES = {
     "colmap": "sparse/0/images.bin", "ply": "point_cloud.ply", "spz": "point_cloud.spz", "sog": "point_cloud.sog",
-    "glb": "point_cloud.glb", "mesh": "mesh.ply", "tum": "trajectory.txt",
+    "glb": "point_cloud.glb", "mesh": "mesh.ply", "tum": "trajectory.txt", "depth": "transforms.json",
     "html": "map.html", "tiles": "tiles/tileset.json", "floorplan": "floorplan.svg", "collision": "collision.glb",
     "usd": "mesh.usdz",
 }  # fmt: skip

@@ -128,7 +128,7 @@ def test_wrong_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_settings_stay_few() -> None:
-    assert sum(len(values) for values in config_to_dict(Config()).values()) <= 46
+    assert sum(len(values) for values in config_to_dict(Config()).values()) <= 47
 
 
 def test_every_setting_has_help() -> None:

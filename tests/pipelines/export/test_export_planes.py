@@ -120,18 +120,18 @@ def test_views_of_a_run_are_made_straight_once(oracle_run: OracleRun, tmp_path: 
     run = oracle_run(video=True)
     count = len(keyframe_rows(load_outcome(run)))
 
-    def context(planes: bool) -> StageContext:
+    def context(planes: str) -> StageContext:
         config = Config(export=ExportConfig(planes=planes))
-        (folder := tmp_path / str(planes)).mkdir(exist_ok=True)
+        (folder := tmp_path / planes).mkdir(exist_ok=True)
         return StageContext(run, run.root, config, folder, SilentProgress())
 
-    for planes in (False, True):
+    for planes in ("off", "straight"):
         in_chunks(context(planes), draw_keyframes, count, move=SAME)
         scratch = context(planes).snapshot / "mesh"
-        assert (mesh_views(scratch, count)[0].unsure is not None) == planes
+        assert (mesh_views(scratch, count)[0].unsure is not None) == (planes != "off")
     found = []
     for _ in range(2):
-        in_chunks(context(True), snap_views, count, planes=planes_in(scratch, count))
+        in_chunks(context(planes), snap_views, count, planes=planes_in(scratch, count))
         found.append({path: path.read_bytes() for path in scratch.glob("*.npz")})
     assert all(v.unsure is None for v in mesh_views(scratch, count))
     assert found[0] == found[1]
