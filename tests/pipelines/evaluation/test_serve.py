@@ -19,6 +19,7 @@ from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.evaluation.film import read_camera_path, render_run
 from msgs_slam.pipelines.evaluation.metrics import psnr
 from msgs_slam.pipelines.evaluation.serve import PageServer, page_of_run, progress_summary
+from msgs_slam.pipelines.evaluation.views import render_outcome
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.run.files import BACKBONE, MAP, SPARSE, TRAJECTORY
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -172,10 +173,11 @@ def test_the_page_follows_the_run_and_records_a_path(run: RunFolder, tmp_path: P
         page.value(f"{IN_MAP}.getElementById('save').click()")
         page.until(lambda: list(downloads.glob("*-path.json")))
     found, t = read_camera_path(next(downloads.glob("*-path.json"))), load_outcome(run).trajectory
-    np.testing.assert_allclose(found.world_from_cam[0], t.world_from_cam[0], atol=1e-4)  # kept over the reload
-    moved = found.world_from_cam[1, :3, 3] - found.world_from_cam[0, :3, 3]
-    assert moved @ t.world_from_cam[0][:3, 2] > 0.1  # ahead
-    assert moved @ t.world_from_cam[0][:3, 0] > 0.1  # and to the right
+    begun = found.world_from_cam[0]  # at one of the cameras, kept over the reload
+    nearest = int(np.linalg.norm(t.world_from_cam[:, :3, 3] - begun[:3, 3], axis=1).argmin())
+    np.testing.assert_allclose(begun, t.world_from_cam[nearest], atol=0.02)  # levelled
+    moved = found.world_from_cam[1, :3, 3] - begun[:3, 3]
+    assert moved @ begun[:3, 2] > 0.1  # ahead
+    assert moved @ begun[:3, 0] > 0.1  # and to the right
     first = read_rgb(list_images(render_run(run, tmp_path / "out", path=next(downloads.glob("*.json")), fps=1.0))[0])
-    own = read_rgb(list_images(render_run(run, tmp_path / "own", path="own", fps=1.0))[0])
-    assert psnr(first, own) > 30
+    assert psnr(first, render_outcome(load_outcome(run), np.linalg.inv(begun)).exposed(None, 0.0)) > 30
