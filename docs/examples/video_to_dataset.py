@@ -28,8 +28,8 @@ from pathlib import Path
 from typing import Any
 
 STAGES = {
-    "frames": "camera poses", "proxy": "depth and classes", "tracking": "remaining poses", "mapping": "map",
-    "global_ba": "closing loops", "export": "files",
+    "frames": "camera poses", "proxy": "depth and classes", "tracking": "loops and remaining poses", "mapping": "map",
+    "global_ba": "poses between", "export": "files",
 }  # fmt: skip
 
 

@@ -16,8 +16,8 @@ T = TypeVar("T")
 _SECONDS_BETWEEN_LINES = 600.0
 log = logging.getLogger("msgs_slam")
 IN_WORDS = {
-    "frames": "camera poses", "proxy": "depth and classes", "tracking": "remaining poses", "mapping": "map",
-    "global_ba": "closing loops", "export": "files",
+    "frames": "camera poses", "proxy": "depth and classes", "tracking": "loops and remaining poses", "mapping": "map",
+    "global_ba": "poses between", "export": "files",
 }  # fmt: skip
 """What the stages bring, for people."""
 BEGUN, ENDED, UP_TO_DATE, STOPPED, REFUSED = "begun", "done", "up to date", "stopped", "failed"
