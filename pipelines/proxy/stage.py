@@ -157,20 +157,21 @@ class ProxyStage:
 
     def _figures(self) -> dict[str, Any]:
         """Summarise the stage for the report."""
-        sizes, reliable, void, errors = [], [], [], []
-        invalid = 0
+        sizes, reliable, void = [], [], []
+        invalid, error, completed = 0, 0.0, 0
         for frame in self.frames:
             path, depth = PROXY_MAPS.path(self.context.folder, frame.id), self.work.depth(frame)
             invalid += depth.invalid
-            errors.append(expected_error(depth.confidence))
+            if self.work.depths.name == MultiviewDepth.name:
+                expected = expected_error(depth.confidence)
+                error, completed = error + float(expected.sum(dtype=np.float64)), completed + len(expected)
             maps = PROXY_MAPS.read(path)
             sizes.append(path.stat().st_size)
             reliable.append(float((maps.confidence > 0.35).mean()))
             void.append(float((maps.labels == VOID).mean()))
         if invalid:
             self.warn(f"{invalid} depth values were NaN, infinite or negative; they count as unknown")
-        depths, semantics, error = self.work.depths, self.work.semantics, np.concatenate(errors)
-        completed = {"completed_error": round(float(error.mean()), 4)} if len(error) else {}
+        depths, semantics = self.work.depths, self.work.semantics
         return {
             "depth": depths.name,
             "semantics": semantics.name,
@@ -181,7 +182,7 @@ class ProxyStage:
             "void_pixels": round(float(np.mean(void)), 4),
             "kilobytes_a_frame": round(float(np.mean(sizes)) / 1000, 1),
             "invalid_depth_values": invalid,
-            **(completed if depths.name == MultiviewDepth.name else {}),
+            **({"completed_error": round(error / completed, 4)} if completed else {}),
             **depths.figures(),
             **semantics.figures(),
         }

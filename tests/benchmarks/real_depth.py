@@ -15,6 +15,7 @@ judge.
 import argparse
 import math
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,9 +74,17 @@ def leave_cases(run: RunFolder, truth: Path, target: Path) -> None:
                 save_arrays(target / f"{i:06d}_{round_}.npz", arrays, compress=False)
 
 
-def load_cases(folder: Path, pattern: str = "*_[01].npz") -> list[Example]:
-    """Load those of a recording, or of a made room, in the order of their names; each counts alike."""
-    return [e for e in map(_read, sorted(folder.glob(pattern))) if (~e.wanted.isnan()).sum() >= _LEAST_PIXELS]
+def load_cases(folder: Path, pattern: str) -> list[Example]:
+    """Load those of a recording, in the order of their names; each counts alike."""
+    return [case for _, case in _known(folder, pattern)]
+
+
+def _known(folder: Path, pattern: str) -> Iterator[tuple[Path, Example]]:
+    """Read the cases of whose unsure pixels enough are known, in the order of their names."""
+    for path in sorted(folder.glob(pattern)):
+        case = _read(path)
+        if (~case.wanted.isnan()).sum() >= _LEAST_PIXELS:
+            yield path, case
 
 
 def _read(path: Path) -> Example:
@@ -107,10 +116,8 @@ def judge(network: CompletionNetwork, cases: list[Example]) -> tuple[float, floa
 def by_size(folder: Path, pattern: str = "*_[01].npz") -> list[list[Path]]:
     """List the cases that can make a batch: more than fit into memory together, so that they are read when drawn."""
     groups: dict[tuple[int, ...], list[Path]] = {}
-    for path in sorted(folder.glob(pattern)):
-        case = _read(path)
-        if (~case.wanted.isnan()).sum() >= _LEAST_PIXELS:
-            groups.setdefault(tuple(case.given.planes.shape), []).append(path)
+    for path, case in _known(folder, pattern):
+        groups.setdefault(tuple(case.given.planes.shape), []).append(path)
     return [g for g in groups.values() if len(g) >= _BATCH]
 
 
