@@ -20,7 +20,7 @@ from ..sfm.driver import Structure
 from ..sfm.given import GivenFit, fit_given_poses
 from ..sfm.lens import Lens
 from ..source.given import numbering
-from ..system.wording import stretches
+from ..system.wording import frames_text, stretches
 from ..types import Frame, GivenPoses
 
 _MIN_PART = 3
@@ -111,10 +111,10 @@ def warn_of_structure(context: StageContext, structure: Structure, ids: list[int
             f"structure from motion could not place {report.total - report.registered} of {report.total} keyframes"
         )
     if structure.loose:
-        named = stretches(ids[k] for k in structure.loose)
+        named = frames_text([ids[k] for k in structure.loose])
         context.warn(
-            f"{len(structure.loose)} of them (frames {named}) show too little to determine their poses, such as a "
-            "strip of floor below a bare wall: they were left out, and tracking searches for them again"
+            f"too little is in view to determine the pose of {named}, such as a strip of floor below a bare wall: left "
+            "out, and searched for again by tracking"
         )
     for piece in structure.pieces:
         inside = sorted(ids[i - 1] for i in piece.reg_image_ids())
@@ -132,8 +132,7 @@ def warn_of_structure(context: StageContext, structure: Structure, ids: list[int
     small = sorted(ids[k] for p in report.components if len(p) < _MIN_PART for k in p)
     if small:
         context.warn(
-            f"{len(small)} keyframes share hardly any points with the others (frames "
-            f"{', '.join(map(str, small))}): tracking searches for them again"
+            f"hardly any points connect {frames_text(small)} with the other keyframes: tracking searches again"
         )
     folds = ", ".join(f"{ids[s.before]}-{ids[s.after]}" for s in report.contradicted)
     agreeing = f"{report.pairs_agreeing:.0%} of the matched pairs of views agree with it (mapper: {structure.mapper})"

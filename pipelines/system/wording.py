@@ -26,6 +26,11 @@ def stretches(ids: Iterable[int], limit: int = MAX_STRETCHES) -> str:
     return ", ".join(texts) + (f" and {len(runs) - limit} more stretches" if len(runs) > limit else "")
 
 
+def frames_text(ids: Sequence[int]) -> str:
+    """[7] -> "frame 7"; [1, 2, 7] -> "frames 1-2, 7"."""
+    return f"frame{'s' * (len(ids) != 1)} {stretches(ids)}"
+
+
 def lost_text(lost: Mapping[str, str]) -> str:
     """Frame → why it is lost, as "12 (too few matches 3-9, 12-16)": all frames of one cause together."""
     causes: dict[str, list[int]] = {}
