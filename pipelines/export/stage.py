@@ -216,7 +216,7 @@ def write_readme(scene: ExportScene, target: Target, files: Iterable[str]) -> No
         axes = _FIRST
     tops = {PIECES if name.startswith(PIECES) else name.partition("/")[0] for name in files}
     known = [*(file for export in EXPORTS for file in export.files), *NOTES]
-    entries = [_entry(file) for file in known if not tops.isdisjoint(file.tops)]
+    entries = [_entry(file) for file in known if file.tops[0] in tops]
     lines = [" ".join(axes.split()), *lengths(outcome.metres, outcome.metric).splitlines()]
     about = [textwrap.fill(line, WIDTH, break_on_hyphens=False) for line in lines]
     used = licences([record.figures for record in outcome.records.values()], outcome.metres)

@@ -228,4 +228,4 @@ def test_a_kind_alone_says_what_it_is(oracle_run: OracleRun, tmp_path: Path) -> 
     names = explained(tmp_path)
     assert "mesh.ply" in names
     assert "point_cloud.spz" in names, "it is still there"
-    assert not any(name.startswith(("masks/", "tiles/", "piece_2")) for name in names)
+    assert not any(name.startswith(("masks/", "tiles/", "piece_2", "depth/")) for name in names)
