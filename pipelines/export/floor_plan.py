@@ -35,6 +35,8 @@ def write_floor_plan(scene: ExportScene, target: Target) -> None:
         spread, about = metres.relative_sd, metres.text
     unit = "m" if about or outcome.metric else "units"
     path = outcome.trajectory.centers[outcome.trajectory.is_posed]
+    if scene.world.earth is None:  # north is up
+        walls, path = levelled(walls, path)
     text = floor_plan(walls, path, outcome.run.place.stem, scene.metres_per_unit, unit, about, spread)
     write_text(target.path(FLOOR_PLAN), text)
 
@@ -82,6 +84,15 @@ def floor_plan(
         "</svg>",
     ]
     return "\n".join(parts) + "\n"
+
+
+def levelled(walls: list[Wall], path: Array) -> tuple[list[Wall], Array]:
+    """Turn walls and path (N, 2 or 3) by 45 degrees at most, until the longest wall lies along an edge of the paper."""
+    x, y = max(walls, key=lambda wall: wall.length).along
+    angle = (np.arctan2(y, x) + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, -s], [s, c]])
+    return [replace(wall, ends=wall.ends @ turn) for wall in walls], path[:, :2] @ turn
 
 
 def _what_is_open(walls: list[Wall]) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.export.floor_plan import Wall, find_walls, floor_plan
+from msgs_slam.pipelines.export.floor_plan import Wall, find_walls, floor_plan, levelled
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import SAME, WORLD, World
@@ -108,6 +108,19 @@ def test_a_plan_says_what_is_open_and_no_digits_that_nobody_knows() -> None:
     for spread, told in ((0.25, "6 m"), (0.1, "6.3 m"), (0.002, "6.34 m")):
         assert f"≥ {told}<" in floor_plan(open_walls, path, "room", 1.0, "m", "", spread)
     assert "Film" not in floor_plan(closed, path, "room", 1.0, "m", "")
+
+
+@pytest.mark.parametrize("degrees", [4.0, 41.0, 139.0, -92.0])
+def test_the_longest_wall_lies_along_an_edge_of_the_paper(degrees: float) -> None:
+    turn = np.array([[np.cos(a := np.radians(degrees)), np.sin(a)], [-np.sin(a), np.cos(a)]])
+    square = [Wall(np.array([[0.0, 0], [5, 0]]) @ turn), Wall(np.array([[5.0, 0], [5, 3]]) @ turn)]
+    path = np.array([[1.0, 1, 1.5], [2, 2, 1.5]])
+    path[:, :2] = path[:, :2] @ turn
+    walls, way = levelled(square, path)
+    assert [min(np.abs(wall.along)) for wall in walls] == pytest.approx([0, 0], abs=1e-9)
+    for before, after in zip(square, walls, strict=True):
+        assert before.along @ after.along >= np.cos(np.radians(45)) - 1e-9, "by the smaller turn"
+        assert (way[0] - after.ends[0]) @ after.normal == pytest.approx(1 if after is walls[0] else 4)
 
 
 def test_the_plan_of_a_run(oracle_run: OracleRun, tmp_path: Path) -> None:
