@@ -118,7 +118,7 @@ def selected_image_path(context: StageContext, name: str) -> Path:
 
 def lossless_image_path(context: StageContext, name: str) -> Path:
     """Return the file that holds a picked image's pixels as they were decoded, where that was asked for."""
-    whole = context.snapshot / LOSSLESS / f"{name}.png"
+    whole = context.snapshot / LOSSLESS / f"{name}.bmp"
     return whole if whole.exists() else selected_image_path(context, name)
 
 
@@ -211,4 +211,4 @@ def _save_selected(
         return
     write_rgb(path, reduced)
     if keep_lossless and path.suffix.lower() != ".png":
-        write_rgb(context.snapshot / LOSSLESS / f"{name}.png", reduced)
+        write_rgb(context.snapshot / LOSSLESS / f"{name}.bmp", reduced)
