@@ -1,6 +1,7 @@
 """What the README, the benchmarks' README and the site say exists: commands, options, settings, files, messages."""
 
 import ast
+import importlib
 import json
 import os
 import re
@@ -10,7 +11,9 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from dataclasses import fields
+from itertools import chain
 from pathlib import Path
+from types import ModuleType
 
 import click
 import pytest
@@ -21,6 +24,7 @@ from msgs_slam.pipelines.run.settings import load_config
 
 ROOT = Path(__file__).resolve().parents[1]
 SITE = ROOT / "docs"
+BENCHMARKS = ROOT / "tests" / "benchmarks"
 DOCS = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
@@ -50,26 +54,31 @@ def test_settings_exist(setting: str) -> None:
     load_config(overrides=[setting])
 
 
-def rows(page: Path, heading: str) -> list[list[str]]:
-    """Cells of the first table after some words."""
-    text = page.read_text(encoding="utf-8").split(heading)[1]
-    lines = re.findall(r"^\|.*\|$", text.split("\n\n|")[1].split("\n\n")[0], re.MULTILINE)
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+def of_benchmarks(name: str) -> ModuleType:
+    """A script of the benchmarks."""
+    sys.path.insert(0, str(BENCHMARKS))
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.pop(0)
 
 
-def test_figures_of_the_readme_are_those_of_the_page() -> None:
-    """Numbers of frames, dB, minutes and gigabytes as they are, centimetres to the README's places."""
-    page = rows(SITE / "figures.md", "has no scale.")
-    told = rows(DOCS[0], "## How good is it?")
-    assert len(told) == 4
-    for name, frames, path, map_quality, cost in told[1:]:
-        words = {"video": "kitchen", "living": "12 m loop", "Replica": "the same"}
-        key = next(v for k, v in words.items() if k in name)
-        found = next(row for row in page if key in row[0])
-        assert frames == found[2]
-        assert map_quality == found[4].split(",")[0]
-        assert cost == found[5]
-        assert f"{float(found[3].split()[0]):.{len(path.split()[0].split('.')[1])}f}" == path.split()[0]
+def test_figures_of_quality_stand_in_one_file() -> None:
+    """`python tests/benchmarks/figures.py` writes them into the pages; no sentence beside them states one."""
+    script = of_benchmarks("figures")
+    figures, pages = script.stated()
+    free = {"docs/figures.md", "docs/method.md", "docs/public.md", "tests/benchmarks/README.md", "CONTRIBUTING.md"}
+    for path in DOCS:
+        text, name = path.read_text(encoding="utf-8"), path.relative_to(ROOT).as_posix()
+        assert script.with_figures(text, pages.get(name, []), figures) == text, name
+        assert name in free or script.others(text, pages.get(name, [])) == [], name
+    readme, sentences = DOCS[0].read_text(encoding="utf-8"), pages["README.md"]
+    figures["kitchen"] |= {"psnr": 31.4, "date": "3 March"}
+    other = script.with_figures(readme, sentences, figures)
+    assert other.count("| 31.4 dB | 5 min, 1.6 GB | 3 March |") == 1 - readme.count("31.4 dB")
+    assert script.others(other + "Draft reaches 30 dB.", sentences) == ["30 dB"]
+    with pytest.raises(ValueError, match="stands 2 times"):
+        script.with_figures(other + other, sentences, figures)
 
 
 def test_no_placeholder_is_left() -> None:
@@ -81,9 +90,6 @@ def test_named_files_exist() -> None:
         assert (ROOT / name).exists(), name
     for name in re.findall(r"python (tests/benchmarks/\w+\.py)", texts()):
         assert (ROOT / name).exists(), name
-
-
-BENCHMARKS = ROOT / "tests" / "benchmarks"
 
 
 def test_every_benchmark_is_on_its_page() -> None:
@@ -242,13 +248,25 @@ def test_settings_page_has_every_setting() -> None:
 
 def test_the_page_of_public_recordings_is_that_of_the_figures_kept() -> None:
     """`python tests/benchmarks/public.py` writes it."""
-    sys.path.insert(0, str(BENCHMARKS))
-    try:
-        from public import KEPT, PAGE, page
-    finally:
-        sys.path.pop(0)
-    assert PAGE.read_text(encoding="utf-8") == page(json.loads(KEPT.read_text(encoding="utf-8")))
-    assert PAGE.read_text(encoding="utf-8").count("| run here |") == 9
+    public = of_benchmarks("public")
+    kept = json.loads(public.KEPT.read_text(encoding="utf-8"))
+    text = public.PAGE.read_text(encoding="utf-8")
+    assert text == public.page(kept)
+    assert text.count("| run here |") == 9
+    assert "| MSGS-SLAM | yes | parts only, below |" in text
+    assert set(kept["sequences"]) <= {*public.PARTS, *chain.from_iterable(public.SETS.values())}
+
+
+def test_a_whole_set_that_was_run_has_its_means_on_the_page() -> None:
+    public = of_benchmarks("public")
+    kept = json.loads(public.KEPT.read_text(encoding="utf-8"))
+    row = {"posed": 9, "frames": 10, "sd": 0.1, "deviations": 0.5, "cpu_seconds": 60.0, "part": ""}
+    for k, name in enumerate(public.SETS["Replica"]):
+        assert "| parts only, below | parts only, below | parts only, below | – |" in public.page(kept)
+        kept["sequences"][name] = row | {"sim3_cm": 1.0 + k, "se3_cm": 2.0 + k, "scale": 0.9 + 0.1 * k}
+    text = public.page(kept)
+    assert "| parts only, below | parts only, below | 4.50 / 5.5 | – / – / 1.25 |" in text
+    assert "| office0 | whole | 9 of 10 | 1.00 | 2.0 | 0.90 ± 10% | 0.5 | 60 |" in text
 
 
 def test_the_man_page_is_that_of_todays_commands() -> None:
