@@ -1,6 +1,8 @@
 """The front end: every frame that structure from motion left out is posed against the keyframes around it; where there
 are none, there are new keyframes, with points from proxy depth or triangulated from the last one."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -99,13 +101,15 @@ class FrontEnd:
         self.promote(near[0])
         return True
 
-    def correspond(self, frame_id: int, start: Array, keyframes: list[int]) -> Sightings:
-        """Points of the keyframes found in the frame by KLT, searched from where `start` (4, 4) puts them."""
+    def correspond(self, frame_id: int, start: Array, keyframes: list[int], most: float = math.inf) -> Sightings:
+        """Points of the keyframes, about so many of each at `most`, found in the frame by KLT, searched from where
+        `start` (4, 4) puts them."""
         seen = NO_SIGHTINGS
         grey = self.pictures.grey(frame_id)
         for keyframe in keyframes:
             known = self.state.sightings[keyframe]
-            known = known.select(~np.isin(known.point, seen.point))
+            rows = np.flatnonzero(~np.isin(known.point, seen.point))
+            known = known.select(rows[:: int(len(rows) // most) + 1])
             points = self.state.points[known.point]
             guess, _ = project(points @ start[:3, :3].T + start[:3, 3], self.pictures.intrinsics)
             xy, found = follow(self.pictures.grey(keyframe), grey, known.xy, guess, window=PATCH)
