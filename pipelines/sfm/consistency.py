@@ -6,8 +6,8 @@ after it.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -42,12 +42,13 @@ MAX_DRIFT = 1.25
 
 @dataclass(frozen=True)
 class ScaleDrift:
-    """By what factor the unit of a path differs at least between two keyframes, `first` and `last`; 1 for a path of one
-    scale."""
+    """By what factor the unit of a path differs at least between two keyframes, `first` and `last`, and the one between
+    at which it changes most; 1 for a path of one scale."""
 
     factor: float = 1.0
     first: int = 0
     last: int = 0
+    at: int = 0
 
 
 NO_DRIFT = ScaleDrift()
@@ -119,21 +120,23 @@ def judge(
     xy: Sequence[NDArray[np.float64]],
     total: int,
     reach: int,
+    breaks: Container[int] = (),
 ) -> ModelReport:
     """Report on a model; `pairs` are indices i of keyframes whose image id is i + 1, `xy` their features' pixels.
 
     total: number of stations; keyframes i, i + total and so on are views from one place in several
-    directions, and the report is about places. `reach`: places at most so many apart are neighbours.
+    directions, and the report is about places. `reach`: places at most so many apart are neighbours. `breaks`: places
+    before which the seam counts as without a point.
     """
     checks = check_pairs(model, pairs, xy, total)
     matches, agreeing = sum(c.matches for c in checks), sum(c.agreeing for c in checks)
     placed, tracks = sorted({(i - 1) % total for i in model.reg_image_ids()}), tracks_of(model, total)
-    seams = find_seams(placed, checks, tracks, reach)
+    seams = [replace(s, points=0) if s.after in breaks else s for s in find_seams(placed, checks, tracks, reach)]
     components = find_components(placed, seams, tracks, reach)
     return ModelReport(
         len(placed), total, model.num_points3D(), median_error(model),
         agreeing / max(matches, 1), sum(c.agrees for c in checks) / max(len(checks), 1),
-        tuple(seams), tuple(map(tuple, components)), scale_drift(model, pairs, xy, total, reach),
+        tuple(seams), tuple(map(tuple, components)), scale_drift(model, pairs, xy, total, reach, placed),
     )  # fmt: skip
 
 
@@ -220,14 +223,18 @@ def unexplained(
 
 
 def scale_drift(
-    model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], xy: Sequence[Array], total: int, reach: int
+    model: pycolmap.Reconstruction,
+    pairs: Sequence[VerifiedPair],
+    xy: Sequence[Array],
+    total: int,
+    reach: int,
+    within: Iterable[int],
 ) -> ScaleDrift:
-    """Measure how the scale of a path changes, by matches of keyframes at most `reach` apart; other arguments as of
-    `consistency.judge`. Of panoramas the first direction is measured."""
+    """Measure how the scale of a path changes `within` places, by matches of keyframes at most `reach` apart; other
+    arguments as of `consistency.judge`. Of panoramas the first direction is measured."""
     camera, focal = model.cameras[1], model.cameras[1].mean_focal_length()
-    placed = [i - 1 for i in sorted(model.reg_image_ids()) if i <= total]
-    poses = {k: model.images[k + 1].cam_from_world().matrix() for k in placed}
-    rays = {k: unit_rays(camera, xy[k]) for k in placed}
+    poses = {k: model.images[k + 1].cam_from_world().matrix() for k in within}
+    rays = {k: unit_rays(camera, xy[k]) for k in poses}
     sides: dict[int, tuple[_Side, _Side]] = defaultdict(lambda: (_Side(), _Side()))
     for pair in pairs:
         i, j = sorted((pair.first, pair.second))
@@ -248,7 +255,8 @@ def scale_drift(
     first, last = sorted(np.unravel_index(int(np.argmax(apart)), apart.shape))
     if not apart[first, last] > 0:
         return NO_DRIFT
-    return ScaleDrift(float(np.exp(apart[first, last])), int(first), int(last) - 1)
+    growing = np.sign(along[last] - along[first]) * steps[first:last]
+    return ScaleDrift(float(np.exp(apart[first, last])), int(first), int(last) - 1, int(first + growing.argmax()))
 
 
 class _Side:

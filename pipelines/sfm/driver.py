@@ -20,7 +20,7 @@ from ..types import Features, Vocabulary
 from .adjust import adjust_model
 from .candidates import GIVEN_ONLY, AdjustedModel, CandidateModels, KeyframeSet
 from .components import cut, remove_keyframes, undetermined_cameras
-from .consistency import ModelReport, judge, scale_drift
+from .consistency import MAX_DRIFT, NO_DRIFT, ModelReport, judge, scale_drift
 from .features import (
     GlobalDescriptors,
     compute_global_descriptors,
@@ -114,23 +114,27 @@ class StructureFromMotion(CandidateModels):
         if found is None:
             raise InputError(why_no_structure(len(features), pairs))
         found, pieces = self._largest_first(found, self._pieces(views, pairs, found.model, apart), views)
-        report, loose = self._divided(found.model, views, pairs)
-        straight = rectified_features(found.model, views.xy, views.times, found.readout)
-        drift = scale_drift(found.model, pairs, straight, self._places(views.xy), self.config.overlap)
-        report = replace(report, drift=drift)
+        report, loose = self._divided(found.model, views, pairs, found.readout)
         return Structure(
             found.model, report, found.mapper, found.focal_sd, features, vocabulary, tried, pairs, pieces,
             found.readout, loose,
         )  # fmt: skip
 
     def _divided(
-        self, model: pycolmap.Reconstruction, views: KeyframeSet, pairs: Sequence[VerifiedPair]
+        self, model: pycolmap.Reconstruction, views: KeyframeSet, pairs: Sequence[VerifiedPair], readout: Readout
     ) -> tuple[ModelReport, list[int]]:
-        """Report on a model, cut into components that share no point, and list the loose keyframes taken out of it."""
-        loose: list[int] = []
+        """Report on a model, cut into components that share no point, also where the scale changes within one, and list
+        the loose keyframes taken out of it."""
+        loose, breaks, range_of = list[int](), set[int](), (self._places(views.xy), self.config.overlap)
+        straight = rectified_features(model, views.xy, views.times, readout)
         while True:
-            report = judge(model, pairs, views.xy, self._places(views.xy), self.config.overlap)
+            report = judge(model, pairs, views.xy, *range_of, breaks)
             cut(model, report.components, report.total)
+            drifts = (scale_drift(model, pairs, straight, *range_of, component) for component in report.components)
+            report = replace(report, drift=max(drifts, key=lambda d: d.factor, default=NO_DRIFT))
+            if report.drift.factor >= MAX_DRIFT and report.drift.at not in breaks:
+                breaks.add(report.drift.at)
+                continue
             found = [] if loose else self._loose(model, views, report)
             if not found:
                 return report, loose

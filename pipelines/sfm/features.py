@@ -20,23 +20,29 @@ from ..types import Features, Vocabulary, require_shape
 _of_thread = threading.local()
 
 
-PEAK_THRESHOLD = 0.004
-"""Contrast of the weakest feature; lower finds more on plain walls."""
+THRESHOLDS, _ENOUGH = (0.004, 0.001), 1 / 600
+"""Contrast of the weakest feature, as a share of the range of grey: the second where the first finds fewer than so many
+for a pixel. Of plain walls there are blotches beyond the noise then; where there is more to see they only add noise."""
 _SUPPORT = 2.0
 """Of a feature's scale: nearer to a mask than this, what moves there affects its position."""
 
 
 def sift_features(
-    grey: NDArray[np.uint8], count: int, left_out: NDArray[np.bool_] | None = None, threshold: float = PEAK_THRESHOLD
+    grey: NDArray[np.uint8],
+    count: int,
+    left_out: NDArray[np.bool_] | None = None,
+    thresholds: Sequence[float] = THRESHOLDS,
 ) -> Features:
     """SIFT features (Lowe 2004) of an (H, W) image, at most about `count`, as RootSIFT (Arandjelović and Zisserman,
     CVPR 2012).
 
-    `threshold` is the least contrast, as a share of the range of grey. None is in the mask `left_out` (H, W), nor
-    reaches into it.
+    `thresholds` are tried until one finds enough. None is in the mask `left_out` (H, W), nor reaches into it.
     """
     require_shape("grey", grey, (None, None))
-    keypoints, found = _extractor(count, threshold).extract_from_uint8_array(np.ascontiguousarray(grey))
+    for threshold in thresholds:
+        keypoints, found = _extractor(count, threshold).extract_from_uint8_array(np.ascontiguousarray(grey))
+        if len(keypoints) >= min(_ENOUGH * grey.size, count / 2):
+            break
     if len(keypoints) == 0:
         return Features(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8))
     features = Features(pycolmap.keypoints_to_matrix(keypoints), np.asarray(found.data, dtype=np.uint8))
@@ -53,8 +59,9 @@ def clear_of(features: Features, left_out: NDArray[np.bool_]) -> Features:
 
 
 def _extractor(count: int, threshold: float) -> pycolmap.FeatureExtractor:
-    """One on each thread: the same image gives the same bytes."""
-    if getattr(_of_thread, "made", None) != (count, threshold):
+    """One of a kind on each thread: the same image gives the same bytes."""
+    made = vars(_of_thread).setdefault("made", {})
+    if (count, threshold) not in made:
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu = False
         options.num_threads = 1
@@ -62,9 +69,8 @@ def _extractor(count: int, threshold: float) -> pycolmap.FeatureExtractor:
         options.sift.peak_threshold = threshold
         # A second orientation gives a second keypoint at the same place: it costs matching time and adds no geometry.
         options.sift.max_num_orientations = 1
-        _of_thread.extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-        _of_thread.made = (count, threshold)
-    return _of_thread.extractor
+        made[count, threshold] = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+    return made[count, threshold]
 
 
 # global descriptors --------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from msgs_slam.pipelines.sfm.features import learn_vocabulary, sift_features
 
 def keep_correspondences(folder: Path, pictures: Mapping[int, np.ndarray]) -> None:
     """Features of these keyframes (RGB), their vocabulary, and that no pair of them was tried."""
-    features = {i: sift_features(to_grey(rgb), 1500, threshold=0.005) for i, rgb in pictures.items()}
+    features = {i: sift_features(to_grey(rgb), 1500, thresholds=(0.005,)) for i, rgb in pictures.items()}
     for frame_id, found in features.items():
         FEATURES.save(folder, found, of=frame_id)
     VOCABULARY.save(folder, learn_vocabulary(list(features.values()), 0))

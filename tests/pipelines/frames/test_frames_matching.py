@@ -15,6 +15,7 @@ from msgs_slam.pipelines.sfm import features as features_module
 from msgs_slam.pipelines.sfm import matching
 from msgs_slam.pipelines.sfm.consistency import epipolar_error, judge
 from msgs_slam.pipelines.sfm.features import (
+    THRESHOLDS,
     GlobalDescriptors,
     far_apart,
     global_descriptor,
@@ -23,7 +24,13 @@ from msgs_slam.pipelines.sfm.features import (
     sequential_pairs,
     sift_features,
 )
-from msgs_slam.pipelines.sfm.matching import VerifiedPair, match_descriptors, verify_matches, write_database
+from msgs_slam.pipelines.sfm.matching import (
+    MIN_INLIERS,
+    VerifiedPair,
+    match_descriptors,
+    verify_matches,
+    write_database,
+)
 from msgs_slam.pipelines.sfm.snapshots import Snapshots
 from msgs_slam.pipelines.sfm.two_views import rotation_residual, why_no_structure
 from msgs_slam.pipelines.types import Features
@@ -202,6 +209,26 @@ def test_features_are_one_a_place_and_none_is_in_the_mask() -> None:
     assert (away > 2 * masked.keypoints[:, 2] - 1).all(), "what moves has no part in where a feature lies"
     near = (all_of_it.xy[:, 0] < WIDTH // 2) & (WIDTH // 2 - all_of_it.xy[:, 0] < 2 * all_of_it.keypoints[:, 2] - 1)
     assert near.any(), "without that, some would lie there"
+
+
+def test_a_plain_wall_shows_enough_to_go_past_it() -> None:
+    """Blotches of a few grey levels under noise; of a picture with more to see weaker features are not looked for."""
+    rng = np.random.default_rng(0)
+    blotches = cv2.GaussianBlur(rng.standard_normal((300, 420)), (0, 0), 8)
+    wall = 150 + 3 * blotches / blotches.std()
+    views = [np.round(wall[:240, x : x + 320] + 2 * rng.standard_normal((240, 320))).astype(np.uint8) for x in (10, 50)]
+    strong, found = (
+        [sift_features(v, 1500, thresholds=limits) for v in views] for limits in (THRESHOLDS[:1], THRESHOLDS)
+    )
+
+    def agreeing(features: list[Features]) -> int:
+        matches = match_descriptors(*(f.descriptors for f in features))
+        step = features[0].xy[matches[:, 0]] - features[1].xy[matches[:, 1]]
+        return int((np.linalg.norm(step - [40, 0], axis=1) < 2).sum())
+
+    assert agreeing(strong) < MIN_INLIERS < 2 * MIN_INLIERS < agreeing(found)
+    grey = cv2.cvtColor(render(*next(iter(sideways(2)))), cv2.COLOR_RGB2GRAY)
+    assert np.array_equal(sift_features(grey, 400).xy, sift_features(grey, 400, thresholds=THRESHOLDS[:1]).xy)
 
 
 def _sliding(step: float, count: int) -> list[tuple[np.ndarray, None]]:

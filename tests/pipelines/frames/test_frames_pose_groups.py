@@ -8,15 +8,17 @@ import pycolmap
 import pytest
 from numpy.typing import NDArray
 
+from msgs_slam.formats.colmap import pose_of, set_pose
 from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.sfm import components as module
 from msgs_slam.pipelines.sfm.adjust import FEATURE_SD
 from msgs_slam.pipelines.sfm.bundle import Bundle, adjust_bundle
 from msgs_slam.pipelines.sfm.components import MAX_SD, pose_groups, relative_sds, undetermined_cameras
+from msgs_slam.pipelines.sfm.consistency import MAX_DRIFT
 from msgs_slam.pipelines.sfm.given import posed_model
-from msgs_slam.pipelines.sfm.rolling import RollingModel
+from msgs_slam.pipelines.sfm.rolling import NO_READOUT, RollingModel
 from msgs_slam.pipelines.types import Intrinsics
-from tests.pipelines.frames.made_views import MadeViews, structure_of, walk_along_bare_wall, walk_round
+from tests.pipelines.frames.made_views import REACH, MadeViews, structure_of, walk_along_bare_wall, walk_round
 from tests.pipelines.frames.test_frames_given import CAMERA
 
 Array = NDArray[np.float64]
@@ -113,9 +115,32 @@ def test_few_are_loose_and_many_are_a_group_of_their_own(strip: tuple[Bundle, In
 def test_structure_from_motion_leaves_them_out(tmp_path: Path) -> None:
     for made, wanted in ((walk_along_bare_wall(CAMERA), STRIP), (walk_round(CAMERA), [])):
         model = model_of(made)
-        report, loose = structure_of(made, CAMERA, tmp_path)._divided(model, made.views(), made.pairs(CAMERA))
+        report, loose = structure_of(made, CAMERA, tmp_path)._divided(
+            model, made.views(), made.pairs(CAMERA), NO_READOUT
+        )
         assert loose == wanted
         count = len(made.features)
         assert sorted(i - 1 for i in model.reg_image_ids()) == sorted(set(range(count)).difference(wanted))
         assert (report.registered, report.total) == (count - len(wanted), count)
         assert made.off(model) < 0.01
+
+
+def test_structure_is_cut_where_its_scale_changes(tmp_path: Path) -> None:
+    """Epipolar lines agree, whatever the step is long; the depths by what is seen from either side do not."""
+    made, middle, factor = walk_round(CAMERA, 32), 16, 1.8
+    model, pairs = model_of(made), made.pairs(CAMERA)
+    whole, _ = structure_of(made, CAMERA, tmp_path)._divided(model, made.views(), pairs, NO_READOUT)
+    assert [len(c) for c in whole.components] == [32]
+    about = se3.inverse(pose_of(model.images[middle + 1]))[:3, 3]
+    for k in range(middle + 1, 32):
+        pose = pose_of(model.images[k + 1])
+        pose[:3, 3] = -pose[:3, :3] @ (about + factor * (se3.inverse(pose)[:3, 3] - about))
+        set_pose(model, k + 1, pose)
+    for point in model.points3D.values():
+        if min(e.image_id for e in point.track.elements) > middle:
+            point.xyz = about + factor * (point.xyz - about)
+    report, _ = structure_of(made, CAMERA, tmp_path)._divided(model, made.views(), pairs, NO_READOUT)
+    assert report.pairs_agreeing > 0.98
+    assert len(report.components) == 2
+    assert all(len(c) == pytest.approx(middle, abs=REACH) for c in report.components)
+    assert report.drift.factor < MAX_DRIFT

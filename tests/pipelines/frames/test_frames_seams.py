@@ -227,14 +227,25 @@ def test_break_between_two_stretches_of_one_scale_each_is_seen(
     poses = views.cam_from_world.copy()
     poses[:, :3, 3] = -np.einsum("nij,nj->ni", poses[:, :3, :3], centers)
     xy = [f.xy for f in views.features]
-    found = scale_drift(bare_model(camera, xy, poses), pairs, xy, VIEWS, WALK_REACH)
+    model = bare_model(camera, xy, poses)
+    found, before, behind = (
+        scale_drift(model, pairs, xy, VIEWS, WALK_REACH, part) for part in (range(VIEWS), range(20), range(20, VIEWS))
+    )
     assert 1.5 < found.factor < 2.1
     assert 20 - 2 * WALK_REACH <= found.first <= 20 <= found.last <= 20 + 2 * WALK_REACH
+    assert abs(found.at - 20) <= WALK_REACH, "there it is cut"
+    assert max(before.factor, behind.factor) < 1.05, "what matches across the cut says nothing of either side"
 
 
 def test_without_matches_nothing_is_said(made: tuple[pycolmap.Camera, MadeViews, list[VerifiedPair]]) -> None:
     camera, views, _ = made
     xy = [f.xy for f in views.features]
-    assert scale_drift(bare_model(camera, xy, views.cam_from_world), [], xy, VIEWS, WALK_REACH) == ScaleDrift()
+    assert (
+        scale_drift(bare_model(camera, xy, views.cam_from_world), [], xy, VIEWS, WALK_REACH, range(VIEWS))
+        == ScaleDrift()
+    )
     unknown = [np.full(p.shape, np.nan) for p in xy]
-    assert scale_drift(bare_model(camera, xy, bent(views, 0.01)), made[2], unknown, VIEWS, WALK_REACH) == ScaleDrift()
+    assert (
+        scale_drift(bare_model(camera, xy, bent(views, 0.01)), made[2], unknown, VIEWS, WALK_REACH, range(VIEWS))
+        == ScaleDrift()
+    )

@@ -138,7 +138,7 @@ def test_no_pose_from_nonsense() -> None:
 def test_features_match_a_turned_picture_and_not_another() -> None:
     first = texture(3, (300, 300))
     turned = np.ascontiguousarray(np.rot90(first))
-    a, b, other = (sift_features(x, 400, threshold=0.005) for x in (first, turned, texture(4, (300, 300))))
+    a, b, other = (sift_features(x, 400, thresholds=(0.005,)) for x in (first, turned, texture(4, (300, 300))))
     pairs = match_descriptors(a.descriptors, b.descriptors)
     # (x, y) goes to (y, 300 - x) in a picture turned to the left.
     wanted = np.stack([a.xy[pairs[:, 0], 1], 300 - a.xy[pairs[:, 0], 0]], 1)
@@ -183,7 +183,7 @@ class OnePicture:
     intrinsics = CAMERA
 
     def __init__(self) -> None:
-        self._features = sift_features(picture(), 400, threshold=0.005)
+        self._features = sift_features(picture(), 400, thresholds=(0.005,))
 
     def features(self, frame_id: int) -> Any:
         return self._features
