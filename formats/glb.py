@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -90,7 +90,7 @@ def write_primitive(
 
 def write_primitives(
     path: Path,
-    nodes: Sequence[tuple[dict[str, str], Sequence[Part]]],
+    nodes: Sequence[tuple[dict[str, Any], Sequence[Part]]],
     primitive: dict[str, Any],
     class_names: Sequence[str],
     extras: dict[str, Any] | None = None,
@@ -168,8 +168,9 @@ def write_glb(path: Path, document: dict[str, Any], parts: Sequence[Part], rest:
 
 @dataclass(frozen=True, eq=False)
 class ClassMesh:
-    """vertices (V, 3) float32 with colors (V, 3) uint8; labels (F,) uint8 of the faces (255 = no class), and
-    which of them are `hidden`, seen by no keyframe; texture (H, W, 3) uint8, without pixels for the vertices' colours.
+    """vertices (V, 3) float32 with colors (V, 3) uint8; labels (F,) uint8 of the faces (255 = no class), which of them
+    are `hidden`, seen by no keyframe, and numbers of their `things`, 0 for none; texture (H, W, 3) uint8, empty for the
+    vertices' colours.
 
     corner_vertex (K,) int64 and corner_uv (K, 2) float32: a vertex has as many corners as charts meet there; u to the
     right and v downwards from the texture's top left, 0..1. faces (F, 3) int32 are corners.
@@ -183,6 +184,7 @@ class ClassMesh:
     faces: NDArray[np.int32]
     texture: NDArray[np.uint8]
     hidden: NDArray[np.bool_] | None = None
+    things: NDArray[np.uint16] | None = None
 
     def __post_init__(self) -> None:
         v, k, f = len(self.vertices), len(self.corner_vertex), len(self.faces)
@@ -204,17 +206,25 @@ class ClassMesh:
         return np.where(length > 0, total / np.maximum(length, 1e-300), [0, 0, 1]).astype(np.float32)
 
 
-def write_mesh_glb(path: Path, mesh: ClassMesh, class_names: tuple[str, ...] = ()) -> None:
-    """Write a GLB with a node for each class, named after it, its number as attribute _LABEL, and another one for what
-    of it is hidden; shown as it is (KHR_materials_unlit), with the texture as a JPEG or with vertex colours.
+def write_mesh_glb(
+    path: Path, mesh: ClassMesh, class_names: tuple[str, ...] = (), thing_names: Mapping[int, str] | None = None
+) -> None:
+    """Write a GLB with a node for each thing, its number in the node's extras, and for each class of all else, named
+    after them, the class's number as attribute _LABEL, and another one for what of them is hidden; shown as it is
+    (KHR_materials_unlit), with the texture as a JPEG or with vertex colours.
 
     glTF wants y up: the caller turns the vertices. The same mesh gives the same bytes. Raises InputError when the disk
     refuses.
     """
-    normals, nodes = mesh.normals, []
-    kinds = mesh.labels if mesh.hidden is None else mesh.labels + 256 * mesh.hidden.astype(np.int64)
+    normals = mesh.normals
+    nodes: list[tuple[dict[str, Any], list[Part]]] = []
+    kinds = mesh.labels.astype(np.int64)
+    kinds += 0 if mesh.hidden is None else 256 * mesh.hidden
+    kinds += 0 if mesh.things is None else 512 * mesh.things.astype(np.int64)
     for kind in np.unique(kinds).tolist():
-        label, name = kind % 256, class_names[kind % 256] if kind % 256 < len(class_names) else _UNNAMED
+        label, thing = kind % 256, kind // 512
+        name = class_names[label] if label < len(class_names) else _UNNAMED
+        name = (thing_names or {}).get(thing, name)
         corners, faces = np.unique(mesh.faces[kinds == kind], return_inverse=True)
         vertex = mesh.corner_vertex[corners]
         shown = Part.of("TEXCOORD_0", mesh.corner_uv[corners])
@@ -228,7 +238,8 @@ def write_mesh_glb(path: Path, mesh: ClassMesh, class_names: tuple[str, ...] = (
             Part.of(LABEL, np.full(len(corners), label, np.float32)),
             Part.of("", faces.reshape(-1).astype(np.uint32)),
         ]
-        nodes.append(({"name": name if kind == label else f"{name}, {_HIDDEN}"}, parts))
+        of_thing = {"extras": {"thing": thing}} if thing else {}
+        nodes.append(({"name": f"{name}, {_HIDDEN}" if kind // 256 % 2 else name, **of_thing}, parts))
     if not mesh.texture.size:
         write_primitives(path, nodes, {"material": 0}, class_names, {"materials": [material()]}, [UNLIT])
         return
@@ -248,11 +259,14 @@ def read_mesh_glb(path: Path) -> ClassMesh:
         document, binary = _document_and_buffer(data)
         parts = [binary[v["byteOffset"] : v["byteOffset"] + v["byteLength"]] for v in document["bufferViews"]]
         columns: list[list[NDArray[Any]]] = [[], [], [], [], []]
+        of_node_things = [int(node.get("extras", {}).get("thing", 0)) for node in document["nodes"]]
+        hidden_nodes = [str(node.get("name", "")).endswith(f", {_HIDDEN}") for node in document["nodes"]]
         for first in range(0, 5 * len(document["meshes"]), 5):
             of_node = [np.frombuffer(part, "<f4") for part in parts[first : first + 4]]
             of_node.append(np.frombuffer(parts[first + 4], "<u4") + sum(map(len, columns[3])))
             for column, values in zip(columns, of_node, strict=True):
                 column.append(values)
+        rows = [len(column) // 3 for column in columns[4]]
         places, _, shown, labels, faces = (np.concatenate(column) for column in columns)
         faces, count = faces.reshape(-1, 3).astype(np.int32), len(labels)
         has_texture = "textures" in document
@@ -260,7 +274,8 @@ def read_mesh_glb(path: Path) -> ClassMesh:
         uv = shown.reshape(-1, 2) if has_texture else np.zeros((count, 2), np.float32)
         picture = decode_rgb(parts[-1], str(path)) if has_texture else np.zeros((0, 0, 3), np.uint8)
         of_faces = labels[faces[:, 0]].astype(np.uint8)
-        return ClassMesh(places.reshape(-1, 3), colors, of_faces, np.arange(count), uv, faces, picture)
+        hidden, things = np.repeat(hidden_nodes, rows), np.repeat(np.array(of_node_things, np.uint16), rows)
+        return ClassMesh(places.reshape(-1, 3), colors, of_faces, np.arange(count), uv, faces, picture, hidden, things)
 
 
 def _document_and_buffer(data: bytes) -> tuple[dict[str, Any], bytes]:

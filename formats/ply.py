@@ -22,6 +22,7 @@ _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int
 _PLACE, _NORMAL, _COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 _POINT = np.dtype([*((n, "<f4") for n in (*_PLACE, *_NORMAL)), *((n, "u1") for n in _COLOR)])
 _VERTEX = np.dtype([*((n, "<f4") for n in _PLACE), *((n, "u1") for n in (*_COLOR, "label"))])
+_OF_THING = np.dtype([*_VERTEX.descr, ("thing", "<u2")])
 _FACE = np.dtype([("vertex_indices", "<i4", (3,))])
 _LISTED = np.dtype([("length", "u1"), *_FACE.descr])
 
@@ -124,8 +125,11 @@ class MeshArrays:
             raise ValueError("MeshArrays: a vertex is not finite, or too far away")
 
     def of_labels(self, labels: Iterable[int]) -> "MeshArrays":
-        """Return the faces whose three vertices have one of these labels, and the vertices that they need."""
-        wanted = np.isin(self.labels, list(labels))
+        """Return the faces whose three vertices have one of these labels, and these vertices."""
+        return self.of_vertices(np.isin(self.labels, list(labels)))
+
+    def of_vertices(self, wanted: NDArray[np.bool_]) -> "MeshArrays":
+        """Return the faces whose three vertices are wanted (V,), and these vertices."""
         faces = self.faces[wanted[self.faces].all(1)]
         used, corners = np.unique(faces, return_inverse=True)
         faces = corners.reshape(-1, 3).astype(np.int32)
@@ -135,24 +139,43 @@ class MeshArrays:
 @dataclass(frozen=True)
 class MeshBlocks:
     """A mesh of which only a part is in memory at a time. `vertices` and `faces` go over it anew whenever they are
-    called: blocks of positions (n, 3) float32, colors (n, 3) uint8, labels (n,) uint8; and of faces (n, 3) int32."""
+    called: blocks of positions (n, 3) float32, colors (n, 3) uint8, labels (n,) uint8; and of faces (n, 3) int32. So do
+    `things`, numbers (n,) of the vertices' things, where the mesh is a file's."""
 
     vertex_count: int
     face_count: int
     vertices: Callable[[], Iterable[tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]]]
     faces: Callable[[], Iterable[NDArray[np.int32]]]
+    things: Callable[[], Iterable[NDArray[np.uint16]]] = tuple
 
 
-def write_mesh_ply(path: Path, mesh: MeshBlocks, class_names: tuple[str, ...] = ()) -> None:
-    """Write a binary PLY with x y z, red green blue and the extra property label (uchar) at each vertex.
+def write_mesh_ply(
+    path: Path, mesh: MeshBlocks, class_names: tuple[str, ...] = (), things: NDArray[np.uint16] | None = None
+) -> None:
+    """Write a binary PLY with x y z, red green blue and the extra property label (uchar) at each vertex, and where
+    `things` (V,) are given the number of its thing (ushort, 0 for none) as the property thing.
 
     Class names go to comments. Raises ValueError for blocks that do not fit, InputError when the disk refuses.
     """
     count, no_faces = mesh.vertex_count, np.zeros((0, 3), np.int32)
-    parts = (MeshArrays(points, no_faces, *rest) for points, *rest in mesh.vertices())
-    vertices = (_filled(_VERTEX, {_PLACE: m.vertices, _COLOR: m.colors, ("label",): m.labels[:, None]}) for m in parts)
+    kind = _VERTEX if things is None else _OF_THING
+
+    def vertices() -> Iterator[NDArray[Any]]:
+        start = 0
+        for points, *rest in mesh.vertices():
+            m = MeshArrays(points, no_faces, *rest)
+            columns: dict[tuple[str, ...], NDArray[Any]] = {
+                _PLACE: m.vertices,
+                _COLOR: m.colors,
+                ("label",): m.labels[:, None],
+            }
+            if things is not None:
+                columns[("thing",)] = things[start : start + len(points), None]
+            start += len(points)
+            yield _filled(kind, columns)
+
     elements = {
-        "vertex": Rows(_VERTEX, count, vertices),
+        "vertex": Rows(kind, count, vertices()),
         "face": Rows(_FACE, mesh.face_count, (_face_rows(faces, count) for faces in mesh.faces())),
     }
     write_ply(path, elements, [f"class {i} {name}" for i, name in enumerate(class_names)])
@@ -171,7 +194,8 @@ def mesh_blocks(path: Path) -> MeshBlocks:
     start = head.find(b"\nend_header\n") + len(b"\nend_header\n")
     counts = {m[1].decode(): int(m[2]) for m in re.finditer(rb"^element (\w+) (\d+)$", head[:start], re.MULTILINE)}
     vertex_count, face_count = (counts.get(name, 0) for name in ("vertex", "face"))
-    faces_at = start + vertex_count * _VERTEX.itemsize
+    kind = _OF_THING if b"\nproperty ushort thing\n" in head[:start] else _VERTEX
+    faces_at = start + vertex_count * kind.itemsize
     if list(counts) != ["vertex", "face"] or faces_at + face_count * _LISTED.itemsize != Path(path).stat().st_size:
         raise InputError(f"{path} is not as this program writes it: export it again")
 
@@ -182,14 +206,23 @@ def mesh_blocks(path: Path) -> MeshBlocks:
                 yield np.fromfile(file, dtype, rows.stop - rows.start)
 
     def vertices() -> Iterator[tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]]:
-        for rows in blocks(_VERTEX, start, vertex_count):
+        for rows in blocks(kind, start, vertex_count):
             points, colors = (np.stack([rows[n] for n in names], 1) for names in (_PLACE, _COLOR))
             yield points, colors, rows["label"].copy()
+
+    def things() -> Iterator[NDArray[np.uint16]]:
+        for rows in blocks(kind, start, vertex_count):
+            yield rows["thing"].copy() if kind is _OF_THING else np.zeros(len(rows), np.uint16)
 
     def faces() -> Iterator[NDArray[np.int32]]:
         return (rows["vertex_indices"] for rows in blocks(_LISTED, faces_at, face_count))
 
-    return MeshBlocks(vertex_count, face_count, vertices, faces)
+    return MeshBlocks(vertex_count, face_count, vertices, faces, things)
+
+
+def read_mesh_things(path: Path) -> NDArray[np.uint16]:
+    """Read the numbers (V,) of the vertices' things, 0 for none. Raises InputError for another file."""
+    return np.concatenate([np.zeros(0, np.uint16), *mesh_blocks(path).things()])
 
 
 def read_mesh_ply(path: Path) -> MeshArrays:

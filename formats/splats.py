@@ -68,8 +68,8 @@ class GaussianCloud:
 
     means (M, 3); log_scales (M, 3) logarithms of the standard deviations along the own axes; quat_wxyz (M, 4) turning
     own axes into the world; opacity_logits (M,); colors (M, 3) RGB seen from everywhere, 0..1 for what a screen can
-    show; all float32. class_ids (M,) uint8 and class_probs (M, C) float32, None where the file has none. View-dependent
-    colour is not kept.
+    show; all float32. class_ids (M,) uint8, class_probs (M, C) float32 and the numbers (M,) uint16 of their things, 0
+    for none; None where the file has none. View-dependent colour is not kept.
     """
 
     means: NDArray[np.float32]
@@ -79,12 +79,13 @@ class GaussianCloud:
     colors: NDArray[np.float32]
     class_ids: NDArray[np.uint8] | None = None
     class_probs: NDArray[np.float32] | None = None
+    things: NDArray[np.uint16] | None = None
 
     def __post_init__(self) -> None:
         m = len(self.means)
         shapes = {"means": (m, 3), "log_scales": (m, 3), "quat_wxyz": (m, 4), "opacity_logits": (m,), "colors": (m, 3)}
         classes = 0 if self.class_probs is None else self.class_probs.shape[-1]
-        for name, shape in {**shapes, "class_ids": (m,), "class_probs": (m, classes)}.items():
+        for name, shape in {**shapes, "class_ids": (m,), "class_probs": (m, classes), "things": (m,)}.items():
             array = getattr(self, name)
             if array is not None and array.shape != shape:
                 raise ValueError(f"GaussianCloud: {name}: got shape {array.shape}, expected {shape}")
@@ -138,7 +139,8 @@ def write_gaussian_ply(
     The properties are those of the original code in its order, as it writes them where it trains without view-dependent
     colour: x y z, nx ny nz (0), f_dc_0..2, opacity (logit), scale_0..2 (log), rot_0..3 (w x y z); after them class_id
     (uchar) and class_prob_<number> (float) where the cloud has classes, of those that are anywhere above 0: tables of
-    100 classes would otherwise fill most of the file with zeros. Class names go to comments.
+    100 classes would otherwise fill most of the file with zeros; and thing (ushort) where it has things. Class names go
+    to comments.
 
     Raises ValueError for a value that is not finite, InputError when the disk refuses.
     """
@@ -150,7 +152,8 @@ def write_gaussian_ply(
     occurring = sorted(found)
     fields = [(name, "<f4") for name in _PLY_FIELDS]
     fields += [("class_id", "u1")] * (parts[0].class_ids is not None)
-    dtype = np.dtype([*fields, *((f"class_prob_{i}", "<f4") for i in occurring)])
+    fields += [(f"class_prob_{i}", "<f4") for i in occurring]
+    dtype = np.dtype([*fields, *[("thing", "<u2")] * (parts[0].things is not None)])
     blocks = (_ply_rows(part, rows, dtype, occurring) for part in parts for rows in slices(len(part)))
     write_ply(path, {"vertex": Rows(dtype, count, blocks)}, [f"class {i} {name}" for i, name in enumerate(class_names)])
 
@@ -168,6 +171,8 @@ def _ply_rows(cloud: GaussianCloud, rows: slice, dtype: np.dtype, occurring: lis
         vertex["class_id"] = part.class_ids
     for i in occurring if part.class_probs is not None else ():
         vertex[f"class_prob_{i}"] = part.class_probs[:, i]  # type: ignore[index]
+    if part.things is not None:
+        vertex["thing"] = part.things
     return vertex
 
 

@@ -263,13 +263,21 @@ Example: msgs-slam export video.msgs --only ply --to shared
     "--only", type=KindOfFile([row.kind for row in EXPORTS]), metavar="KIND",
     help="Write one kind of file only. Default: all kinds that every run writes.",
 )  # fmt: skip
+@click.option(
+    "--only-things", default="", metavar="NAMES",
+    help='Write these things alone, such as "chair 2,table": names as `list` says them, or classes for all of a kind.',
+)  # fmt: skip
+@click.option(
+    "--without", default="", metavar="NAMES",
+    help='Leave these things out, such as "person,sofa 1"; floor and walls continue where they stood.',
+)  # fmt: skip
 @click.option("--to", type=FOLDER, metavar="DIR", help="Where to write. Default: RUN/exports/KIND, or all.")
 @OVERWRITE
 @settings_options
 @verbosity_options
 def export(
-    run_path: Path, only: str | None, to: Path | None, overwrite: bool, config_file: Path | None,
-    overrides: tuple[str, ...], output: Output,
+    run_path: Path, only: str | None, only_things: str, without: str, to: Path | None, overwrite: bool,
+    config_file: Path | None, overrides: tuple[str, ...], output: Output,
 ) -> None:  # fmt: skip
     """Write exports, as the help above says."""
     if others := [text for text in overrides if not text.startswith("export.")]:
@@ -287,7 +295,7 @@ def export(
     settings = with_absolute_paths(load_config(config_file, overrides, base=made_with(run))).export
     folder = to or export_folder(run, only)
     with on_sigterm(signal.SIG_DFL):
-        written = export_run(run, folder, only, output.progress(), settings, overwrite)
+        written = export_run(run, folder, only, output.progress(), settings, overwrite, only_things, without)
     for path in written:
         if not output.quiet:
             say(path)
@@ -360,7 +368,7 @@ def show_config(config_file: Path | None, overrides: tuple[str, ...]) -> None:
     click.echo(config_to_toml(load_config(config_file, overrides)), nl=False)
 
 
-for command in (results.status, results.evaluate, results.report, results.render, results.view):
+for command in (results.status, results.list_things, results.evaluate, results.report, results.render, results.view):
     main.add_command(command)
 main.add_command(models)
 main.add_command(batch)

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..pipelines.system.wording import figure_text
+from ..formats.errors import InputError
+from ..pipelines.system.wording import figure_text, quoted
 from .options import OVERWRITE, RUN_ARGUMENT, open_run, use_threads
 from .output import Output, format_table, on_sigterm, say, terminal_width, verbosity_options, was_shown
 
@@ -56,6 +57,38 @@ def status(run_path: Path, verbose: bool, as_json: bool) -> None:
         say(line)
     for line in [*(f"warning: {w}" for w in found.warnings), *warning_lines(records), *found.notes]:
         say(line)
+
+
+@click.command("list")
+@RUN_ARGUMENT
+@click.option("--json", "as_json", is_flag=True, help="The same as JSON: all of things.json.")
+@click.option("--csv", "as_csv", is_flag=True, help="The same as comma-separated values.")
+def list_things(run_path: Path, as_json: bool, as_csv: bool) -> None:
+    """List the things that were found in RUN: names, sizes, and how sure each is.
+
+    \b
+    Example: msgs-slam list video.msgs
+    """
+    run = open_run(run_path)
+    from ..pipelines.export.inventory import THINGS, inventory_csv
+
+    if (things := run.find(THINGS)) is None:
+        raise InputError(
+            f"{run.root} has no list of its things: run `msgs-slam resume {quoted(run.root)} --redo export`"
+        )
+    if as_json:
+        click.echo(json.dumps(THINGS.pack(things), indent=1))
+    elif as_csv:
+        click.echo(inventory_csv(things), nl=False)
+    elif not things:
+        say("No things were found: the mesh shows walls, floors and ceilings alone.")
+    else:
+        head = ["thing", "width x depth x height", "views", "faces", "a thing", "so called"]
+        rows = [
+            [t.name, t.size_text, str(t.views), str(t.faces), f"{100 * t.sure:.0f}%", f"{100 * t.class_share:.0f}%"]
+            for t in things
+        ]
+        say(format_table(head, rows, terminal_width()))
 
 
 @click.command()

@@ -26,11 +26,12 @@ if TYPE_CHECKING:
     from .formats.ply import MeshArrays
     from .formats.splats import GaussianCloud
     from .pipelines.evaluation.views import MapView
+    from .pipelines.export.inventory import FoundThings, Thing
     from .pipelines.run.outcome import Outcome
     from .pipelines.system.progress import Progress
     from .pipelines.types import Frame, Intrinsics
 
-__all__ = ["InputError", "Measured", "Poses", "Run", "__version__", "open_run", "reconstruct"]
+__all__ = ["Found", "InputError", "Measured", "Poses", "Run", "__version__", "open_run", "reconstruct"]
 
 
 def __getattr__(name: str) -> str:
@@ -54,6 +55,31 @@ class Measured(NamedTuple):
 
     value: float
     sd: float
+
+
+class Found:
+    """A thing that was found in a run: `about` it says all that things.json does, such as name, size and center."""
+
+    def __init__(self, run: Run, about: Thing, among: FoundThings) -> None:
+        self._run, self.about, self._among = run, about, among
+
+    def __repr__(self) -> str:
+        return f"Found({self.about.name!r}, {self.about.size_text})"
+
+    @property
+    def name(self) -> str:
+        """Its name with its number, such as "chair 2"."""
+        return self.about.name
+
+    def mesh(self) -> MeshArrays:
+        """The faces of the exported surface that are of it."""
+        mesh = self._run.mesh()
+        return mesh.of_vertices(self._among.numbers == self.about.number)
+
+    def gaussians(self) -> GaussianCloud:
+        """The part of the map that is of it."""
+        cloud = self._run.gaussians
+        return cloud.only(self._among.of(cloud.means) == self.about.number)
 
 
 class Run:
@@ -142,6 +168,18 @@ class Run:
         labels = [self._label(name) for name in classes]
         mesh = read_mesh_ply(self._outcome.run.file("export", "mesh.ply"))
         return mesh.of_labels(labels) if labels else mesh
+
+    @property
+    def things(self) -> list[Found]:
+        """The things of the exported mesh, as in things.json, with what of mesh and map they are. Raises InputError
+        where the export is not done."""
+        from .pipelines.export.scene import things_of_run
+        from .pipelines.scene.world import FIRST, WORLD
+
+        run = self._outcome.run
+        if (found := things_of_run(run, run.find(WORLD) or FIRST)) is None:
+            raise InputError(f"{self.path} has no list of its things: make its export anew")
+        return [Found(self, thing, found) for thing in found.table]
 
     def _label(self, name: str) -> int:
         if name not in self.classes:

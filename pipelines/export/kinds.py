@@ -51,6 +51,11 @@ class Export:
     when: Literal["always", "in submaps", "asked for"] = "asked for"
     also: tuple[str, ...] = ()
 
+    @property
+    def holds_things(self) -> bool:
+        """Whether some of the things can be left out of it."""
+        return self.kind not in ("colmap", "depth", "tum")
+
     def writer(self) -> Any:
         """Import the function that writes it."""
         module, _, function = self.write.partition(".")
@@ -127,7 +132,8 @@ EXPORTS = (
             ExportedFile(
                 "point_cloud.ply",
                 "the map: Gaussians in the layout of the original 3D Gaussian splatting; after it class_id, and "
-                "class_prob_N, the probability of class number N, for each class that occurs",
+                "class_prob_N, the probability of class number N, for each class that occurs; thing, the number of its "
+                "thing in things.json, 0 for none",
                 "SuperSplat and other splat viewers",
             ),
             ExportedFile(
@@ -176,15 +182,21 @@ EXPORTS = (
         (
             ExportedFile(
                 "mesh.ply",
-                "the surface with all its vertices, a colour and a label (property label) at each",
+                "the surface with all its vertices, and at each a colour, its class (property label) and its thing "
+                "(property thing, 0 is none)",
                 "MeshLab, trimesh",
             ),
             ExportedFile(
                 "mesh.glb",
-                "a lighter surface, at most export.triangles, with normals and a node for each class, named after it "
-                "(attribute _LABEL: its number); a texture made from the keyframes, exposure removed, or without "
-                "export.texture colours of the vertices; unlit",
+                "a lighter surface, at most export.triangles, with normals and nodes named after things, and classes "
+                "of the rest (attribute _LABEL: its number); a texture made from the keyframes, exposure removed, or "
+                "without export.texture colours of the vertices; unlit",
                 "Blender, game engines, the web",
+            ),
+            ExportedFile(
+                "things.json",
+                "the things that were found: name, class, upright box with its size and how certain that is, numbers "
+                "of faces, Gaussians and views; property thing of mesh.ply and point_cloud.ply has their numbers",
             ),
         ),
         "mesh.write_mesh", settings=("voxel", "planes", "texture", "triangles"), when="always", also=("texture",),

@@ -3,6 +3,8 @@
 Faces are taken away by quadrics (Garland and Heckbert 1997).
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -43,7 +45,7 @@ def _with_faces(mesh: MeshArrays, rows: NDArray[np.int64], faces: NDArray[np.int
     return MeshArrays(mesh.vertices[rows], faces[whole].astype(np.int32), mesh.colors[rows], mesh.labels[rows])
 
 
-def lightened(mesh: MeshArrays, most: int) -> tuple[MeshArrays, NDArray[np.uint8]]:
+def lightened(mesh: MeshArrays, most: int) -> tuple[MeshArrays, NDArray[Any]]:
     """At most so many faces, and their labels (F,), whose borders stay where they are."""
     labels, pairs, edges = _labels_of_faces(mesh)
     middles = mesh.vertices[mesh.faces].mean(axis=1)
@@ -52,7 +54,7 @@ def lightened(mesh: MeshArrays, most: int) -> tuple[MeshArrays, NDArray[np.uint8
     return light, labels[nearest]
 
 
-def _labels_of_faces(mesh: MeshArrays) -> tuple[NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]]:
+def _labels_of_faces(mesh: MeshArrays) -> tuple[NDArray[Any], NDArray[np.int64], NDArray[np.int64]]:
     """(F,) what most corners of a face are, without small spots; the pairs of faces (E, 2) that share an edge, and
     the edges (E, 2)."""
     of_corners = mesh.labels[mesh.faces]
@@ -65,12 +67,12 @@ def _labels_of_faces(mesh: MeshArrays) -> tuple[NDArray[np.uint8], NDArray[np.in
         at_border = labels[pairs[:, 0]] != labels[pairs[:, 1]]
         spot = components(pairs[~at_border], len(labels))
         is_small = np.bincount(spot) < least
-        votes = np.zeros((len(is_small), 256), np.int32)
+        votes = np.zeros((len(is_small), int(labels.max(initial=0)) + 1), np.int32)
         for a, b in (pairs[at_border].T, pairs[at_border][:, ::-1].T):
             counts = ~is_small[spot[b]]
             np.add.at(votes, (spot[a][counts], labels[b][counts]), 1)
         changed = is_small & (votes.max(axis=1) > 0)
-        labels = np.where(changed[spot], votes.argmax(axis=1).astype(np.uint8)[spot], labels)
+        labels = np.where(changed[spot], votes.argmax(axis=1).astype(labels.dtype)[spot], labels)
     return labels, pairs, edges[order[:-1][same]]
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ...formats.glb import ClassMesh, write_mesh_glb
-from ...formats.ply import MeshArrays, mesh_blocks, read_mesh_ply, write_mesh_ply
+from ...formats.ply import MeshArrays, MeshBlocks, mesh_blocks, read_mesh_ply, write_mesh_ply
 from ..config import ExportConfig
 from ..geometry.camera import resample_nearest
 from ..geometry.posed_depth import PosedDepth
@@ -27,9 +27,10 @@ from ..system.progress import Progress
 from ..system.threads import get_threads, host_threads
 from ..system.values import load_value, save_value
 from ..types import VOID
+from .inventory import FoundThings, things_in
 from .light import SHARE, clustered, lightened, smoothed_rims
 from .planes import Planes, planes_of, put_planes, snap_to_planes
-from .scene import ExportScene
+from .scene import ExportScene, write_things
 from .surface import Region, chunk_surfaces, closed, filled, joined, weld
 from .texture import textured
 from .volume import BEHIND, Grid, fuse, make_grid
@@ -48,12 +49,16 @@ _KEPT_BYTES = 100e6
 
 
 def write_mesh(scene: ExportScene, target: Target) -> None:
-    """Draw the map in the keyframes, snap uncertain depths to planes, fuse all region by region, join the regions, and
-    write mesh.ply with all its vertices, and mesh.glb, lighter and with a texture where the settings want one.
+    """Draw the map in the keyframes, snap uncertain depths to planes, fuse all region by region, join the regions, find
+    the things, and write mesh.ply with all its vertices, and mesh.glb, lighter and with a texture where the settings
+    want one; with things.json. Of a scene of some things only, write what is left of the run's own meshes.
 
     Files that are there stay. The tasks load the map themselves; what does not fit into memory is in the snapshot of
     the scene's context.
     """
+    if scene.choice is not None:
+        write_chosen(scene, target)
+        return
     context, outcome, settings = scene.context, scene.outcome, scene.settings
     names, axes = outcome.classes.names, scene.world.gltf_from_exported
     ply, glb = target.path("mesh.ply"), target.path("mesh.glb")
@@ -66,25 +71,54 @@ def write_mesh(scene: ExportScene, target: Target) -> None:
         in_chunks(context, snap_views, count, planes=planes)
     planes = planes if settings.planes == "complete" else None
     views = mesh_views(scratch, count)
-    if not ply.exists():
+    whole = scratch / "mesh.ply"
+    if not whole.exists():
         grid = _grid_around(views, settings, planes)
         regions, class_ids = len(list(grid.regions())), tuple(outcome.label_of_channel.tolist())
         in_chunks(context, fuse_views, regions, grid=grid, views=count, class_ids=class_ids, planes=planes)
         # Regions are loaded one at a time, whenever `joined` goes over them.
-        write_mesh_ply(ply, joined(lambda: (load_value(_region_file(scratch, n)) for n in range(regions))), names)
-    if not (mesh := read_mesh_ply(ply)).faces.size:
+        write_mesh_ply(whole, joined(lambda: (load_value(_region_file(scratch, n)) for n in range(regions))), names)
+    mesh, shown = read_mesh_ply(whole), DepthViews(views)
+    things = things_in(mesh, names, scene.world, shown, scene.things_before()).on(mesh.vertices)
+    write_things(scene, target, things)
+    write_mesh_ply(ply, mesh_blocks(whole), names, things.numbers)
+    if not mesh.faces.size:
         context.warn("the mesh is empty: no surface is seen by enough keyframes")
         return
-    shown = DepthViews(views)
     most = min(settings.triangles, round(SHARE * len(mesh.faces))) if settings.texture else settings.triangles
-    light, labels = lightened(filled(smoothed_rims(clustered(mesh)), shown), most)
+    kinds, label_of, thing_of = _kinds(mesh, things)
+    of_kinds = replace(mesh, labels=kinds)  # type: ignore[arg-type] # any integers do
+    light, of_faces = lightened(filled(smoothed_rims(clustered(of_kinds)), shown), most)
+    labels = label_of[of_faces]
     if settings.texture:
         made = textured(outcome, light, labels, shown, context.progress)
     else:
         uv, nothing = np.zeros((len(light.vertices), 2), np.float32), np.zeros((0, 0, 3), np.uint8)
         made = ClassMesh(light.vertices, light.colors, labels, np.arange(len(uv)), uv, light.faces, nothing)
-    made = replace(made, hidden=_is_hidden(light, shown))
-    write_mesh_glb(glb, replace(made, vertices=(made.vertices @ axes.T).astype(np.float32)), names)
+    made = replace(made, hidden=_is_hidden(light, shown), things=thing_of[of_faces])
+    write_mesh_glb(glb, replace(made, vertices=(made.vertices @ axes.T).astype(np.float32)), names, things.names)
+
+
+def write_chosen(scene: ExportScene, target: Target) -> None:
+    """Write those things of the run's meshes that are wanted, and floor and walls where others stood."""
+    names, axes, (mesh, numbers) = scene.outcome.classes.names, scene.world.gltf_from_exported, scene.mesh_of_things()
+    vertices = [(mesh.vertices, mesh.colors, mesh.labels)]
+    blocks = MeshBlocks(len(mesh.vertices), len(mesh.faces), lambda: vertices, lambda: [mesh.faces])
+    write_mesh_ply(target.path("mesh.ply"), blocks, names, numbers)
+    write_things(scene, target, scene.things)
+    if (light := scene.light_mesh()) is not None:
+        turned = replace(light, vertices=(light.vertices @ axes.T).astype(np.float32))
+        write_mesh_glb(target.path("mesh.glb"), turned, names, scene.things.names)
+
+
+def _kinds(mesh: MeshArrays, things: FoundThings) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.uint16]]:
+    """(V,) what no face of the lighter mesh reaches over the border of: things, and classes elsewhere; and of each
+    kind its label and thing."""
+    table = np.full(1 + int(things.numbers.max(initial=0)), VOID, np.uint8)
+    table[[t.number for t in things.table]] = [t.label for t in things.table]
+    labels = np.where(things.numbers > 0, table[things.numbers], mesh.labels).astype(np.int64)
+    pairs, kinds = np.unique(256 * things.numbers.astype(np.int64) + labels, return_inverse=True)
+    return kinds.reshape(-1), (pairs % 256).astype(np.uint8), (pairs // 256).astype(np.uint16)
 
 
 def _is_hidden(mesh: MeshArrays, views: Iterable[PosedDepth]) -> NDArray[np.bool_]:

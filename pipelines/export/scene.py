@@ -2,8 +2,10 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ...formats.errors import InputError
@@ -16,10 +18,13 @@ from ..run.files import MESH
 from ..run.folder import RunFolder
 from ..run.outcome import Outcome, map_cloud
 from ..run.stages import StageContext
+from ..run.target import Target
 from ..scene.gps import world_on_earth
 from ..scene.metres import find_metres
 from ..scene.world import FIRST, WORLD, World, find_upright, in_world, upright_world
 from ..types import Metres
+from .holes import cut_light, cut_map, cut_mesh, holes_in
+from .inventory import NO_THINGS, THINGS, FoundThings, Selection, Thing, in_metres, load_things
 
 MESH_GLB = "mesh.glb"
 _FREE = "The unit of lengths is free: one camera cannot measure metres. Metric depth or --scale-ref makes them metres."
@@ -28,11 +33,14 @@ _FREE = "The unit of lengths is free: one camera cannot measure metres. Metric d
 @dataclass(frozen=True)
 class ExportScene:
     """outcome: poses, map and points in the `world` of the exported files, and how long its unit is; context: settings,
-    threads, tasks and warnings of whoever exports."""
+    threads, tasks and warnings of whoever exports; things: those of the mesh, as soon as there is one; choice: which of
+    them are wanted, by which the outcome's map is cut already."""
 
     outcome: Outcome
     world: World
     context: StageContext
+    things: FoundThings = NO_THINGS
+    choice: Selection | None = None
 
     @property
     def settings(self) -> ExportConfig:
@@ -50,21 +58,47 @@ class ExportScene:
     def cloud(self, rows: Tensor | slice | None = None) -> GaussianCloud:
         """Return the map, or `rows` of it, in the axes of splat formats: x right, y down, z forward."""
         cloud = map_cloud(self.outcome, rows)
+        if self.things.table:
+            cloud = replace(cloud, things=self.gaussian_things[slice(None) if rows is None else rows])
         return replace(cloud, means=(cloud.means @ self.world.image_axes_from_exported.T).astype(np.float32))
 
+    @cached_property
+    def gaussian_things(self) -> NDArray[np.uint16]:
+        """(M,) the number of the thing that each Gaussian is of, 0 for none."""
+        return self.things.of(self.outcome.require_map().means.cpu().numpy())
+
+    def things_before(self) -> tuple[Thing, ...]:
+        """Read the things of an earlier export of the run; none where there was none, or its list is damaged."""
+        try:
+            return THINGS.find(self.outcome.run.path("export")) or ()
+        except InputError:
+            return ()
+
     def mesh(self) -> MeshArrays:
-        """Read the mesh that the run's own export has made, as `mesh_of_run`."""
-        return mesh_of_run(self.outcome.run, self.world)
+        """Read the mesh that the run's own export has made, as `mesh_of_run`: the things of it that are wanted."""
+        return self.mesh_of_things()[0]
+
+    def mesh_of_things(self) -> tuple[MeshArrays, NDArray[np.uint16]]:
+        """Return the same mesh with the numbers (V,) of its vertices' things."""
+        mesh, numbers = mesh_of_run(self.outcome.run, self.world), self.things.numbers
+        if not len(numbers):
+            numbers = np.zeros(len(mesh.vertices), np.uint16)
+        return (mesh, numbers) if self.choice is None else cut_mesh(mesh, numbers, self.choice, self.world)
 
     def light_mesh(self) -> ClassMesh | None:
-        """Read the lighter mesh that the run's own export has made, z up; None where it has none."""
+        """Read the lighter mesh that the run's own export has made, z up, the things of it that are wanted; None where
+        it has none."""
         run, own = self.outcome.run, self.outcome.run.find(WORLD)
         if own is None or not run.has("export", MESH_GLB):
             return None
         mesh = read_mesh_glb(run.file("export", MESH_GLB))
         turned = mesh.vertices.astype(np.float64) @ own.gltf_from_exported
         move = self.world.exported_from_run @ own.exported_from_run.inverse()
-        return replace(mesh, vertices=move.apply(turned).astype(np.float32))
+        mesh = replace(mesh, vertices=move.apply(turned).astype(np.float32))
+        if self.choice is None:
+            return mesh
+        whole = mesh_of_run(self.outcome.run, self.world)
+        return cut_light(mesh, self.choice, holes_in(whole, self.things.numbers, self.choice, self.world))
 
     def without_map(self) -> "ExportScene":
         """Return the scene for writers that load the map themselves."""
@@ -120,7 +154,47 @@ def finished_scene(outcome: Outcome, context: StageContext) -> ExportScene:
     outcome = in_world(outcome, world)
     if outcome.metres is not None and outcome.metres.is_guess and settings.scale == "free":
         outcome = replace(outcome, metres=None)
-    return ExportScene(outcome, world, context)
+    things = things_of_run(outcome.run, world) or NO_THINGS
+    return ExportScene(outcome, world, context, things)
+
+
+def things_of_run(run: RunFolder, world: World) -> FoundThings | None:
+    """Load the things that a run's own export has found, and move them into `world`; None where it has none."""
+    if not (run.holds(THINGS, "export") and run.has("export", MESH)):
+        return None
+    found, own = load_things(run.file("export", THINGS.name), run.file("export", MESH)), run.find(WORLD)
+    if own is None:
+        return found
+    return found.moved(world.exported_from_run @ own.exported_from_run.inverse())
+
+
+def chosen_scene(scene: ExportScene, choice: Selection) -> ExportScene:
+    """Return the scene with those things alone that are wanted, and floor and walls where others stood."""
+    outcome = scene.outcome
+    whole = mesh_of_run(outcome.run, scene.world)
+    cut = cut_map(outcome, scene.gaussian_things, choice, holes_in(whole, scene.things.numbers, choice, scene.world))
+    table = tuple(t for t in scene.things.table if (t.number in choice.numbers) == choice.only)
+    things = replace(scene.things, table=table)
+    return replace(scene, outcome=replace(outcome, gaussian_map=cut), choice=choice, things=things)
+
+
+def write_things(scene: ExportScene, target: Target, things: FoundThings) -> None:
+    """Write things.json, with metres where the scene knows them."""
+    metres, outcome = outcome_metres(scene), scene.outcome
+    per_unit, spread = (1.0, 0.0) if outcome.metric and metres is None else metres or (None, 0.0)
+    THINGS.save(target.path(THINGS.name).parent, in_metres(things.table, per_unit, spread))
+
+
+def written_things(target: Target, world: World) -> FoundThings:
+    """Load what `write_mesh` has written into a folder."""
+    found = load_things(target.folder / THINGS.name, target.folder / MESH)
+    return found or NO_THINGS
+
+
+def outcome_metres(scene: ExportScene) -> tuple[float, float] | None:
+    """Return metres per unit of the files and their relative deviation; None where they are unknown."""
+    metres = scene.outcome.metres
+    return None if metres is None else (scene.metres_per_unit, metres.relative_sd)
 
 
 def lengths(metres: Metres | None, metric: bool) -> str:

@@ -49,9 +49,19 @@ from ..system.machine import release_free_memory
 from ..system.progress import Progress, SilentProgress, WithinStage
 from ..types import Metres
 from .colmap import write_colmap, write_trajectory
+from .inventory import read_selection
 from .kinds import EXPORTS, IMAGES, NOTES, PIECES, README, WORLD_NOTE, Export, ExportedFile, export_of, names_of
 from .mesh import mesh_figures
-from .scene import ExportScene, estimate_metres, find_world, finished_scene, lengths
+from .scene import (
+    ExportScene,
+    chosen_scene,
+    estimate_metres,
+    find_world,
+    finished_scene,
+    lengths,
+    write_things,
+    written_things,
+)
 
 EXPORTS_FOLDER = "exports"
 """The folder in a run for what is exported on request, a folder a kind; no stage touches it."""
@@ -83,20 +93,25 @@ def run(context: StageContext) -> dict[str, Any]:
     for reason in reasons:
         context.warn(reason)
     metres = estimate_metres(context, found, world)
-    scene = ExportScene(in_world(replace(found, metres=metres), world), world, context)
-    del found  # one map is enough
+    found = in_world(
+        replace(found, metres=metres, gaussian_map=None), world
+    )  # the mesh's tasks load the map themselves
     release_free_memory()
     write_pieces(context)
     target, kinds = Target(context.folder), stage_exports(context.run)
+    scene = ExportScene(found, world, context)
+    for export in (export for export in kinds if export.kind == "mesh"):
+        export.writer()(scene, target)
+    release_free_memory()
+    own_map = load_outcome(context.run, context.device).require_map().moved(world.exported_from_run)
+    scene = replace(scene, outcome=replace(found, gaussian_map=own_map), things=written_things(target, world))
     for export in (export for export in kinds if export.kind != "mesh"):
         export.writer()(scene, target)
     write_notes(scene, target, metres)
-    figures = {"images": int(scene.outcome.trajectory.is_posed.sum()), "gaussians": len(scene.outcome.require_map())}
-    scene = scene.without_map()
-    release_free_memory()
-    for export in (export for export in kinds if export.kind == "mesh"):
-        export.writer()(scene, target)
+    write_things(scene, target, scene.things.counted(scene.gaussian_things))
     write_readme(scene, target, files_in(target.folder))
+    figures = {"images": int(found.trajectory.is_posed.sum()), "gaussians": len(own_map)}
+    figures["things"] = len(scene.things.table)
     mesh = mesh_figures(target.folder / "mesh.ply")
     return {**figures, **mesh, **world_figures(world), **metres_figures(metres)}
 
@@ -150,17 +165,25 @@ def export_run(
     progress: Progress | None = None,
     settings: ExportConfig | None = None,
     overwrite: bool = False,
+    only_things: str = "",
+    without: str = "",
 ) -> list[Path]:
     """Write one of the `EXPORTS`, or with None all that the stage writes, of a run into a folder; returns what was
     written.
 
-    folder: None for `export_folder`; settings: None for the run's own. What is written takes the place of an earlier
+    folder: None for `export_folder`; settings: None for the run's own; only_things, without: names of things or classes
+    with commas between them, for the kinds that hold things. What is written takes the place of an earlier
     export; of other files only where they may be overwritten (see `Target`). Nothing changes before all of it is made.
     Raises InputError for a run without a map, or without a mesh for what is made from it, and for a folder that holds
     such files of somebody else, or belongs to the run.
     """
     folder = export_folder(run, only) if folder is None else folder
     exports = [export_of(only)] if only else stage_exports(run)
+    choice = read_selection(run, only_things, without, run.load(CLASSES).names)
+    if choice is not None:
+        exports = [export for export in exports if export.holds_things]
+        if not exports:
+            raise InputError(f"{only} holds no things: leave out --only-things and --without, or choose another kind")
     names = names_of(exports, [WORLD_NOTE] if only else NOTES)
     _require_free(run, folder, names)
     if any(export.needs == "mesh" for export in exports) and not run.has(STAGES[-1], MESH):
@@ -170,12 +193,13 @@ def export_run(
     outcome = load_outcome(run)
     config = replace(outcome.config, export=settings or outcome.config.export)
     scene = finished_scene(outcome, StageContext(run, Path(), config, Path(), progress or SilentProgress()))
+    scene = scene if choice is None else chosen_scene(scene, choice)
     with Target(folder, overwrite, _origin(scene)).replacing(names.__contains__) as staged:
         with tempfile.TemporaryDirectory(dir=staged.folder) as scratch:
             scene = replace(scene, context=replace(scene.context, folder=Path(scratch)))
             for export in exports:
                 export.writer()(scene, staged)
-        if only:
+        if only or choice is not None:
             write_world(scene, staged)
         else:
             write_notes(scene, staged, scene.outcome.metres)

@@ -8,6 +8,7 @@ import base64
 import gzip
 import json
 import re
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from ..run.outcome import Outcome, map_cloud, spread_sample
 from ..run.target import Target
 from ..scene.world import SAME, Z_UP_FROM_Y_DOWN, World
 from ..types import VOID
+from .inventory import NO_THINGS, FoundThings, Thing
 from .kinds import WEB_PAGE
 from .scene import ExportScene
 
@@ -30,11 +32,11 @@ MAX_GAUSSIANS = 1_500_000
 """About 20 MB of page, what can be sent by mail; of larger maps the least visible are left out."""
 _MIN_BYTES = 10
 """A Gaussian's in the page; 12 in the rooms measured."""
-MAX_CAMERAS = 120
+MAX_CAMERAS, MAX_THINGS = 120, 255
 EXPORTED, RUN = "exported", "run"
 """Worlds of a camera path: that of the exported files, and that of a run without an export."""
 PARTS = Path(__file__).parent / "page"
-_SCRIPTS = ("cloud.js", "draw.js", "moves.js", "look.js", "tape.js", "record.js", "page.js")
+_SCRIPTS = ("cloud.js", "draw.js", "moves.js", "look.js", "tape.js", "record.js", "things.js", "page.js")
 
 
 def write_web_page(scene: ExportScene, target: Target) -> None:
@@ -42,16 +44,23 @@ def write_web_page(scene: ExportScene, target: Target) -> None:
     count = len(scene.outcome.require_map())
     require_room(target.folder / WEB_PAGE, _MIN_BYTES * min(count, MAX_GAUSSIANS))
     if count:
-        write_text(target.path(WEB_PAGE), page_of(scene.outcome, scene.world))
+        write_text(target.path(WEB_PAGE), page_of(scene.outcome, scene.world, things=scene.things))
 
 
-def page_of(outcome: Outcome, world: World, is_exported: bool = True, elements: str = "Gaussians") -> str:
+def page_of(
+    outcome: Outcome,
+    world: World,
+    is_exported: bool = True,
+    elements: str = "Gaussians",
+    things: FoundThings = NO_THINGS,
+) -> str:
     """Return the page of a map that is in `world` and holds one Gaussian at least.
 
     is_exported: camera paths are recorded in the coordinates of the exported files, else in the run's own; elements:
-    what the page calls the Gaussians.
+    what the page calls the Gaussians; things: those that can be chosen in it.
     """
     cloud = map_cloud(outcome)
+    cloud = replace(cloud, things=things.of(cloud.means))
     upright = np.eye(3) if world.axes == "up" else Z_UP_FROM_Y_DOWN
     back = SAME if is_exported else world.exported_from_run.inverse()
     about, packed = pack_cloud(cloud, upright)
@@ -61,6 +70,7 @@ def page_of(outcome: Outcome, world: World, is_exported: bool = True, elements: 
         text = f"{metres.text[0].upper()}{metres.text[1:]}."
         about["unit"] |= {"per_unit": metres.per_unit, "relative_sd": metres.relative_sd, "text": text}
     about["floor"] = world.has_floor
+    about["things"] = [_thing(thing, upright) for thing in things.table if thing.number <= MAX_THINGS]
     about |= {"elements": elements, "recorded": {
         "world": EXPORTED if is_exported else RUN,
         "turn": (back.rotation @ upright.T).ravel().tolist(), "shift": back.translation.tolist(),
@@ -69,10 +79,10 @@ def page_of(outcome: Outcome, world: World, is_exported: bool = True, elements: 
 
 
 def pack_cloud(cloud: GaussianCloud, upright: NDArray[np.float64]) -> tuple[dict[str, Any], bytes]:
-    """Pack a cloud for `cloud.js`: ranges for reading it, and 12 bytes per Gaussian, one plane per byte, gzipped.
+    """Pack a cloud for `cloud.js`: ranges for reading it, and 13 bytes per Gaussian, one plane per byte, gzipped.
 
     A position is 16 bits of a logarithm per axis, as a difference to the Gaussian before it in Morton order; radius,
-    opacity, colour and class take 8 bits each. The same cloud gives the same bytes.
+    opacity, colour, class and thing take 8 bits each. The same cloud gives the same bytes.
     """
     total, opacity = len(cloud), 1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))
     if total > MAX_GAUSSIANS:
@@ -90,6 +100,8 @@ def pack_cloud(cloud: GaussianCloud, upright: NDArray[np.float64]) -> tuple[dict
     planes += list(np.round(255 * cloud.colors.clip(0, 1)).T)
     planes.append(np.round(255 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))))
     planes.append(np.full(len(cloud), VOID, np.uint8) if cloud.class_ids is None else cloud.class_ids)
+    things = np.zeros(len(cloud), np.uint16) if cloud.things is None else cloud.things
+    planes.append(np.where(things <= MAX_THINGS, things, 0))
     packed = gzip.compress(np.stack(planes).astype(np.uint8).tobytes(), compresslevel=9, mtime=0)
     about = {
         "count": len(cloud), "total": total, "low": low.tolist(), "high": high.tolist(),
@@ -105,6 +117,16 @@ def _classes(cloud: GaussianCloud, outcome: Outcome) -> dict[str, Any]:
     shares = np.bincount(cloud.class_ids, minlength=256) / len(cloud)
     table = zip(outcome.classes.names, outcome.classes.colors, shares.tolist(), strict=False)
     return {"classes": [{"name": n, "color": list(color), "share": round(share, 5)} for n, color, share in table]}
+
+
+def _thing(thing: Thing, upright: NDArray[np.float64]) -> dict[str, Any]:
+    """What the page says of a thing, and its box."""
+    center, axes = upright @ np.array(thing.center), np.array(thing.axes) @ upright.T
+    return {
+        "n": thing.number, "name": thing.name, "called": thing.class_share, "text": thing.size_text,
+        "views": thing.views, "sure": thing.sure,
+        "center": np.round(center, 4).tolist(), "axes": np.round(axes, 5).tolist(), "size": list(thing.size),
+    }  # fmt: skip
 
 
 def _cameras(outcome: Outcome, upright: NDArray[np.float64]) -> dict[str, Any]:

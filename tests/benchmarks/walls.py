@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import Dataset, open_sequence
 from msgs_slam.pipelines.evaluation.truth import match_truth
-from msgs_slam.pipelines.export.floor_plan import Wall, find_walls, walls_of_run
+from msgs_slam.pipelines.export.floor_plan import walls_of_run
+from msgs_slam.pipelines.export.walls import Wall, find_walls
 from msgs_slam.pipelines.geometry.se3 import Similarity, align_points
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.outcome import load_outcome

@@ -26,13 +26,13 @@ from msgs_slam.pipelines.evaluation.metrics import DepthError, DepthErrorSum, se
 from msgs_slam.pipelines.evaluation.truth import associate
 from msgs_slam.pipelines.evaluation.views import depth_picture, depth_range, view_map
 from msgs_slam.pipelines.export.colmap import seen_points
-from msgs_slam.pipelines.export.floor_plan import find_walls
 from msgs_slam.pipelines.export.light import lightened, simplified
 from msgs_slam.pipelines.export.meshes import with_floor
 from msgs_slam.pipelines.export.planes import find_planes
 from msgs_slam.pipelines.export.surface import chunk_surfaces, joined, weld
 from msgs_slam.pipelines.export.texture import texels_wanted
 from msgs_slam.pipelines.export.volume import Grid, fuse, make_grid
+from msgs_slam.pipelines.export.walls import find_walls
 from msgs_slam.pipelines.geometry.camera import resize_maps
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth, neighbours, overlaps
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel

@@ -24,7 +24,8 @@ async function unpackCloud(about, base64) {
     places[4 * i + 3] = Math.exp(smallest + ((largest - smallest) * radii[i]) / 255);
     for (let c = 0; c < 4; c++) colors[4 * i + c] = bytes[(7 + c) * n + i];
   }
-  return { count: n, places, colors, classes: plane(11), order: new Uint32Array(n), shown: new Uint8Array(256).fill(1) };
+  const [shown, shownThings] = [0, 1].map(() => new Uint8Array(256).fill(1));
+  return { count: n, places, colors, classes: plane(11), things: plane(12), order: new Uint32Array(n), shown, shownThings };
 }
 
 // Fills cloud.order far to near with what a camera can see and returns how many those are. The bits of a positive
@@ -35,7 +36,7 @@ sorting.float[0] = NEAR;
 sorting.from = sorting.bits[0];
 
 function sortCloud(cloud, camera, slopeX, slopeY) {
-  const { places, classes, shown, order } = cloud, { r, p } = camera, { counts, float, bits, from } = sorting;
+  const { places, classes, things, shown, shownThings, order } = cloud, { r, p } = camera, { counts, float, bits, from } = sorting;
   if (!sorting.key || sorting.key.length < cloud.count) sorting.key = new Uint32Array(cloud.count);
   const key = sorting.key, hidden = BUCKETS;
   counts.fill(0);
@@ -43,7 +44,7 @@ function sortCloud(cloud, camera, slopeX, slopeY) {
     const x = places[4 * i] - p[0], y = places[4 * i + 1] - p[1], z = places[4 * i + 2] - p[2];
     const depth = r[6] * x + r[7] * y + r[8] * z, reach = CUT_SIGMAS * places[4 * i + 3];
     const across = Math.abs(r[0] * x + r[1] * y + r[2] * z), down = Math.abs(r[3] * x + r[4] * y + r[5] * z);
-    if (depth <= NEAR || across > slopeX * depth + reach || down > slopeY * depth + reach || !shown[classes[i]]) {
+    if (depth <= NEAR || across > slopeX * depth + reach || down > slopeY * depth + reach || !shown[classes[i]] || !shownThings[things[i]]) {
       key[i] = hidden;
       continue;
     }
@@ -91,22 +92,23 @@ function seenFrom(cloud, about) {
   return cones;
 }
 
-// Where a line of sight meets the map: the median of its light's way, and half the span of the middle 68 % of it.
+// Where a line of sight meets the map: the median of its light's way, the Gaussian there, and half the span of the
+// middle 68 % of it.
 function touchCloud(cloud, origin, direction) {
-  const { places, colors, classes, shown } = cloud, met = [];
+  const { places, colors, classes, things, shown, shownThings } = cloud, met = [];
   for (let i = 0; i < cloud.count; i++) {
-    if (!shown[classes[i]]) continue;
+    if (!shown[classes[i]] || !shownThings[things[i]]) continue;
     const x = places[4 * i] - origin[0], y = places[4 * i + 1] - origin[1], z = places[4 * i + 2] - origin[2];
     const depth = x * direction[0] + y * direction[1] + z * direction[2], radius = places[4 * i + 3];
     const missed = (x * x + y * y + z * z - depth * depth) / (radius * radius);
     if (depth > 0 && missed < CUT_SIGMAS * CUT_SIGMAS)
-      met.push([depth, Math.min((colors[4 * i + 3] / 255) * Math.exp(-missed / 2), ALPHA_MAX)]);
+      met.push([depth, Math.min((colors[4 * i + 3] / 255) * Math.exp(-missed / 2), ALPHA_MAX), i]);
   }
   met.sort((a, b) => a[0] - b[0]);
   let left = 1;
   const covered = met.map(([, alpha]) => 1 - (left *= 1 - alpha)), all = 1 - left;
   if (all < 0.5) return null;
-  const at = (share) => met[covered.findIndex((c) => c >= share * all)][0];
-  const depth = at(0.5), along = (at(0.84) - at(0.16)) / 2;
-  return { point: origin.map((v, k) => v + depth * direction[k]), direction, along, depth };
+  const at = (share) => met[covered.findIndex((c) => c >= share * all)];
+  const [depth, , index] = at(0.5), along = (at(0.84)[0] - at(0.16)[0]) / 2;
+  return { point: origin.map((v, k) => v + depth * direction[k]), direction, along, depth, index };
 }

@@ -5,9 +5,9 @@ const find = (id) => document.getElementById(id);
 const about = JSON.parse(find("about").textContent);
 const canvas = find("scene"), overlay = find("overlay"), note = find("note");
 const wanted = new URLSearchParams(location.hash.slice(1)), bare = wanted.has("bare");
-const state = { mode: wanted.get("mode") || "color", move: "orbit", measuring: false, ends: [], text: "", showPath: false, playing: 0, keyframes: [] };
+const state = { mode: wanted.get("mode") || "color", move: "orbit", measuring: false, ends: [], text: "", showPath: false, playing: 0, keyframes: [], thing: 0, hidden: [], alone: 0 };
 const eye = makeEye(about);
-let cloud, draw, waiting = false, zoom = 1;
+let cloud, draw, choose, waiting = false, zoom = 1;
 
 start().catch((error) => { find("message").textContent = `The map cannot be shown: ${error.message}`; });
 
@@ -23,6 +23,7 @@ async function start() {
   reset();
   keepOverReload(about, eye, state);
   addLegend();
+  choose = addThings(cloud, about, state, note, again);
   addButtons();
   addPointers();
   addKeys();
@@ -98,6 +99,8 @@ function paint() {
     pen.fillText(text, x, y);
   };
   if (state.showPath) line(about.path, "#f97316", 2);
+  const thing = about.things.find(({ n }) => n === state.thing);
+  if (thing) edgesOf(thing).forEach((edge) => line(edge, "#fcd34d", 2));
   if (state.ends.length === 2) line(state.ends.map((e) => e.point), "#ef4444", 3);
   if (!state.playing) line(state.keyframes.map((key) => key.p), "#22c55e", 3);
   for (const xy of state.ends.map((e) => onScreen(e.point))) {
@@ -199,14 +202,17 @@ function play(done) {
   step();
 }
 
+// A click chooses a thing, or a place to measure from; a double click the middle to turn around.
 function click(x, y, asTarget) {
   const ratio = window.devicePixelRatio || 1, view = lens();
   const ray = [(x * ratio - view[2]) / view[0], (y * ratio - view[3]) / view[1], 1];
   const direction = unit([0, 1, 2].map((k) => ray[0] * eye.r[k] + ray[1] * eye.r[3 + k] + eye.r[6 + k]));
   const found = touchCloud(cloud, eye.p, direction);
+  if (!found && !state.measuring && !asTarget) { choose(0); return; }
   if (!found) { note.textContent = "No surface there: click on the map."; return; }
   found.across = (AIM_PIXELS * ratio * found.depth) / view[0];
   if (asTarget) { eye.look(eye.p, found.point); again(); return; }
+  if (!state.measuring) { choose(cloud.things[found.index]); return; }
   state.ends = state.ends.length === 1 ? [state.ends[0], found] : [found];
   state.text = state.ends.length === 2 ? tapeBetween(...state.ends, about) : "";
   const floor = about.floor ? ` ${lengthText(found.point[2], found.along, about)} over the floor.` : "";
@@ -244,7 +250,7 @@ function addPointers() {
   };
   canvas.onpointerup = canvas.onpointercancel = (event) => {
     held.delete(event.pointerId);
-    if (event.type === "pointerup" && moved < 8 && state.measuring) click(event.clientX, event.clientY, false);
+    if (event.type === "pointerup" && moved < 8 && held.size === 0) click(event.clientX, event.clientY, false);
   };
   canvas.ondblclick = (event) => { if (!state.measuring) click(event.clientX, event.clientY, true); };
   canvas.addEventListener("wheel", (event) => {

@@ -92,7 +92,7 @@ class Camera:
 def film(lit: LitRoom, moving: Moving, camera: Camera, target: Path, r: Random) -> None:
     """Write video.mp4 and the truth beside it, whole or not at all."""
     part = target.with_suffix(".part")
-    for name in ("rgb", "depth", "labels", "beside"):
+    for name in ("rgb", "depth", "labels", "things", "beside"):
         (part / name).mkdir(parents=True, exist_ok=True)
     times = np.arange(int(moving.seconds * camera.rate)) / camera.rate
     options = {"crf": str(int(r.integers(16, 26))), "threads": "1"}
@@ -110,6 +110,8 @@ def film(lit: LitRoom, moving: Moving, camera: Camera, target: Path, r: Random) 
         depth, label = lit.measure(exact[k], camera.width, camera.height, camera.focal)
         cv2.imwrite(str(part / f"depth/{k:06d}.png"), np.round(depth * 1000).astype(np.uint16))
         cv2.imwrite(str(part / f"labels/{k:06d}.png"), label + np.uint8(1))
+        seen = lit.things(exact[k], camera.width, camera.height, camera.focal)
+        cv2.imwrite(str(part / f"things/{k:06d}.png"), seen)
         depths.append(depth)
     _describe(part, exact, times, camera)
     _write_beside(part / "beside", lit, look, exact, np.stack(depths))

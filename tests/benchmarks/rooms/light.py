@@ -37,7 +37,8 @@ class LitRoom:
         flat, area = flat[good] / area[good, None], area[good]
         points, normals, places = points[good], normals[good], places[good]
         self.points, self.places, self.flat = (np.ascontiguousarray(a, np.float32) for a in (points, places, flat))
-        self.material, self.label = material[good].astype(np.int32), label[good].astype(np.int32)
+        self.material, self.label = material[good].astype(np.int32), label[good].astype(np.int32) % 256
+        self.thing = label[good].astype(np.int32) // 256
         self.normals = _repaired(normals, flat)
         self.scene = rtcore_scene.EmbreeScene()
         TriangleMesh(self.scene, self.points)
@@ -108,6 +109,12 @@ class LitRoom:
         """Depth and class alone of `photograph`."""
         ways, origins, length = _rays(world_from_cam, width, height, focal, 1)
         return self._first_hit(self.cast(origins, ways), length, (height, width))
+
+    def things(self, world_from_cam: NDArray, width: int, height: int, focal: float) -> NDArray[np.uint16]:
+        """(h, w) number of the thing that is seen; 0 for walls, floors, ceilings, windows and doors."""
+        ways, origins, _ = _rays(world_from_cam, width, height, focal, 1)
+        hit = self.cast(origins, ways)["primID"]
+        return np.where(hit >= 0, self.thing[np.maximum(hit, 0)], 0).reshape(height, width).astype(np.uint16)
 
     def _first_hit(
         self, hit: dict[str, Any], length: NDArray, size: tuple[int, int]

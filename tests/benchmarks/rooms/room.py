@@ -185,6 +185,7 @@ def _hang_lights(room: Room, r: Random) -> None:
         a, b = min(r.uniform(0.2, 1.2), wide - 0.5), r.uniform(0.2, 0.6)
         x, z = r.uniform(0.2, wide - a - 0.2), r.uniform(0.2, deep - b - 0.2)
         drop = 0.04 if r.random() < 0.7 else r.uniform(0.2, 0.7)
+        s.new_thing()
         s.quad((x, high - drop, z), (a, 0, 0), (0, 0, b), s.material((0.5,) * 3, emission=2 * glow), light=glow)
         s.box((x - 0.03, high - drop - 0.005, z - 0.03), (x + a + 0.03, high - drop + 0.04, z + b + 0.03), rim,
               faces=(0, 1, 4, 5))  # fmt: skip
@@ -246,6 +247,7 @@ class _Furnisher:
 
     def put(self, what: str | Piece, frame: Array, style: Style | None = None, scale: float = 1.0) -> None:
         """Add a thing whose back stands at the frame's origin."""
+        self.s.new_thing()
         if isinstance(what, str):
             build_piece(self.s, what, style or self.style(what), frame, self.r)
             return
@@ -328,6 +330,7 @@ class _Furnisher:
         wall = self.room.walls[0]
         w = min(r.uniform(2, 4), wall.length - 0.4)
         u, board = (wall.length - w) / 2, self.s.material(linear(color(r, "thing") * 255))
+        self.s.new_thing()
         self.s.box((u, 0.85, 0.0), (u + w, 2.0, 0.03), board, wall.frame)
 
     def _on_top(self, frame: Array, w: float, h: float, d: float) -> None:
@@ -355,6 +358,7 @@ class _Furnisher:
         if any(o.left < u + w + 0.1 and o.right > u - 0.1 for o in wall.openings) or u + w > wall.length:
             return
         dice, frame = r.random(), wall.frame
+        self.s.new_thing()
         if dice < 0.65:
             t, rim = r.uniform(0.01, 0.04), r.uniform(0, 0.05)
             self.s.box((u, v, 0), (u + w, v + h, t), thing_material(self.s, r), frame)
@@ -376,4 +380,5 @@ class _Furnisher:
         image, span = (carpet, paper)[r.integers(2)](r, color(r, "thing"))
         if r.random() < 0.4:
             image, span = picture(r, self.room.catalogue.textures), 2.0
+        self.s.new_thing()
         self.s.box((x, 0, z), (x + w, 0.012, z + d), self.s.material((1, 1, 1), image, span))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from .textures import Random
 
 CLASSES = ("wall", "floor", "ceiling", "window", "door", "furniture", "thing", "lamp")
+FIRST_OF_THINGS = CLASSES.index("furniture")
 Array = NDArray[np.float64]
 UP = np.array([0.0, 1.0, 0.0])
 THICK = 0.14
@@ -41,8 +42,8 @@ class Opening:
 
 
 class Surfaces:
-    """Triangles with materials and classes, and the rectangles that give light. What is added stands in the frame
-    `place` (4, 4)."""
+    """Triangles with materials, classes and numbers of things, and the rectangles that give light. What is added stands
+    in the frame `place` (4, 4)."""
 
     def __init__(self) -> None:
         self.place = np.eye(4)
@@ -50,7 +51,7 @@ class Surfaces:
         self.materials: list[Material] = []
         self.textures: list[NDArray[np.uint8]] = []
         self.lights: list[tuple[Array, Array, Array, Array]] = []
-        self.label = 0
+        self.label, self.thing, self.things = 0, 0, 0
 
     def material(
         self,
@@ -70,8 +71,14 @@ class Surfaces:
         return len(self.materials) - 1
 
     def of_class(self, name: str) -> None:
-        """What is added from here on is of this class."""
+        """What is added from here on is of this class; of walls, floors, ceilings, windows and doors it is no thing."""
         self.label = CLASSES.index(name)
+        self.thing = 0 if self.label < FIRST_OF_THINGS else self.thing
+
+    def new_thing(self) -> None:
+        """What is added from here on is a thing of its own."""
+        self.things += 1
+        self.thing = self.things
 
     def add(
         self, triangles: NDArray, places: NDArray, material: int | NDArray[np.int32], normals: NDArray | None = None
@@ -83,7 +90,7 @@ class Surfaces:
             flat /= np.maximum(np.linalg.norm(flat, axis=1), 1e-12)[:, None]
             normals = np.repeat(flat[:, None], 3, 1)
         numbers = np.broadcast_to(np.asarray(material, np.int32), len(triangles))
-        labels = np.full(len(triangles), self.label, np.int32)
+        labels = np.full(len(triangles), self.label + 256 * self.thing, np.int32)
         turn, start = self.place[:3, :3].T, self.place[:3, 3]
         shape = (triangles @ turn + start).astype(np.float32), (normals @ turn).astype(np.float32)
         self.parts.append((*shape, np.asarray(places, np.float32), numbers, labels))

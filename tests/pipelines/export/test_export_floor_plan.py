@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from msgs_slam.formats.errors import InputError
-from msgs_slam.pipelines.export.floor_plan import Wall, find_walls, floor_plan, levelled
+from msgs_slam.pipelines.export.floor_plan import floor_plan, levelled
 from msgs_slam.pipelines.export.stage import export_run
+from msgs_slam.pipelines.export.walls import Wall, find_walls
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.scene.world import SAME, WORLD, World
 

@@ -22,6 +22,7 @@ from msgs_slam.formats.errors import InputError
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.config import ExportConfig
 from msgs_slam.pipelines.export import texture as textured
+from msgs_slam.pipelines.export.inventory import THINGS
 from msgs_slam.pipelines.export.kinds import EXPORTS, NOTES, Export, export_of, kinds_help
 from msgs_slam.pipelines.export.scene import ExportScene, find_world
 from msgs_slam.pipelines.export.stage import export_folder, export_run, licences
@@ -139,7 +140,7 @@ def test_texture_shows_the_photographs(run: RunFolder, folder: Path, exported: O
 def test_one_kind_of_mesh_and_colours_without_a_texture(run: RunFolder, tmp_path: Path) -> None:
     few = replace(SETTINGS, texture=False)
     names = [path.name for path in export_run(run, tmp_path, "mesh", settings=few)]
-    assert names == ["mesh.ply", "mesh.glb", "world.json", "README.txt"]
+    assert sorted(names) == ["README.txt", "mesh.glb", "mesh.ply", "things.json", "world.json"]
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted([LIST, *names])
     glb, ply = (trimesh.load(tmp_path / n, force="mesh", process=False) for n in ("mesh.glb", "mesh.ply"))
     assert 0.9 * len(ply.faces) < len(glb.faces) < 1.2 * len(ply.faces)
@@ -152,9 +153,11 @@ def test_one_kind_of_mesh_and_colours_without_a_texture(run: RunFolder, tmp_path
     glb = trimesh.load_scene(tmp_path / "light" / "mesh.glb", process=False)
     assert 300 < sum(len(part.faces) for part in glb.geometry.values()) <= 500
     names = load_outcome(run).classes.names
+    things = {thing.name for thing in THINGS.read(tmp_path / "light" / "things.json")}
+    assert things
     seen = {name for name in glb.geometry if not name.endswith(", hidden")}
-    assert {"wall", "floor"} & set(names) <= seen <= {*names, "unknown"}
-    assert {name.removesuffix(", hidden") for name in set(glb.geometry) - seen} <= {*names, "unknown"}
+    assert {"wall", "floor"} & set(names) <= seen <= {*names, *things, "unknown"}
+    assert {name.removesuffix(", hidden") for name in set(glb.geometry) - seen} <= {*names, *things, "unknown"}
 
 
 def test_one_kind_alone(run: RunFolder, tmp_path: Path) -> None:

@@ -21,8 +21,10 @@ from msgs_slam.pipelines.config import Config
 from msgs_slam.pipelines.evaluation.metrics import psnr
 from msgs_slam.pipelines.evaluation.views import view_map
 from msgs_slam.pipelines.export import web_page
+from msgs_slam.pipelines.export.inventory import FoundThings, Thing
 from msgs_slam.pipelines.export.scene import ExportScene
 from msgs_slam.pipelines.export.stage import export_run
+from msgs_slam.pipelines.export.things import STRUCTURE
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.outcome import Outcome, load_outcome, map_cloud
 from msgs_slam.pipelines.run.stages import StageContext
@@ -53,7 +55,7 @@ def part(text: str, name: str) -> str:
 def unpacked(text: str) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
     """What the page's script makes of it: about, (M, 4) places and radii, (M, 5) colours, opacities and classes."""
     about = json.loads(part(text, "about"))
-    planes = np.frombuffer(gzip.decompress(base64.b64decode(part(text, "map"))), np.uint8).reshape(12, about["count"])
+    planes = np.frombuffer(gzip.decompress(base64.b64decode(part(text, "map"))), np.uint8).reshape(13, about["count"])
     steps = np.cumsum(planes[0:6:2].astype(np.int64) * 256 + planes[1:6:2], axis=1) % 65536
     low, high = np.array(about["low"])[:, None], np.array(about["high"])[:, None]
     logs = low + (high - low) * steps / 65535
@@ -101,7 +103,7 @@ def test_a_large_map_keeps_what_is_seen_most(page: tuple[Path, Outcome], monkeyp
     cloud = map_cloud(page[1])
     about, packed = web_page.pack_cloud(cloud, np.eye(3))
     assert (about["count"], about["total"]) == (500, len(cloud))
-    assert len(gzip.decompress(packed)) == 12 * 500
+    assert len(gzip.decompress(packed)) == 13 * 500
     assert about["log_radii"][0] > np.median(cloud.log_scales)
 
 
@@ -246,3 +248,70 @@ def screenshot(address: str, folder: Path) -> Path:
     done = subprocess.run([str(CHROMIUM), *words], capture_output=True, text=True, timeout=HANGS)
     assert target.exists(), done.stderr[-1000:]
     return target
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed here to open the page with")
+def test_a_thing_is_clicked_hidden_shown_alone_and_its_command_copied(
+    page: tuple[Path, Outcome], tmp_path: Path
+) -> None:
+    outcome, world = page[1], WORLD.read(page[0].with_name("world.json"))
+    means, (things, name) = outcome.require_map().means.numpy(), one_thing(outcome)
+    path = tmp_path / "map.html"
+    path.write_text(web_page.page_of(outcome, world, things=things), encoding="utf-8")
+    t, k = outcome.trajectory, outcome.calibration.intrinsics
+    row, (u, v) = seen_from(outcome, means[things.numbers == 1])
+    note, by_id = "document.getElementById('note').textContent", "document.getElementById({!r})"
+    with browser(tmp_path / "profile", SIZE) as tab:
+        tab.call("Page.navigate", url=f"{path.as_uri()}#camera={t.frame_ids[row]}&bare")
+        tab.until(lambda: tab.value("document.documentElement.dataset.ready") == "1")
+        assert tab.value(f"{by_id.format('thing')}.hidden")
+        whole, (width, height) = tab.scene(), tab.canvas()
+        scale = min(width / k.width, height / k.height)
+        tab.click(width / 2 + scale * (u - k.width / 2), height / 2 + scale * (v - k.height / 2))
+        tab.until(lambda: tab.value(note).startswith(f"{name}: 1.00 x 0.50 x 0.80 m"))
+        assert "seen in 7 views, 65% sure" in tab.value(note)
+        assert tab.value(f"{by_id.format('things')}.value") == "1"
+        tab.value(f"{by_id.format('hide')}.click()")
+        tab.wait_for_change(whole)
+        tab.value(f"{by_id.format('copy')}.click()")
+        tab.until(lambda: tab.value(note) == f'msgs-slam export RUN --without "{name}"')
+        tab.value(f"{by_id.format('hide')}.click()")
+        tab.until(lambda: np.abs(tab.scene().astype(int) - whole).mean() < 1)
+        tab.value(f"{by_id.format('alone')}.click()")
+        alone = tab.wait_for_change(whole)
+        assert (alone.max(axis=2) < 8).mean() > (whole.max(axis=2) < 8).mean() + 0.2, "the rest is black"
+        tab.value(f"{by_id.format('copy')}.click()")
+        tab.until(lambda: tab.value(note) == f'msgs-slam export RUN --only-things "{name}"')
+        tab.value(f"{by_id.format('all')}.click()")
+        tab.until(lambda: np.abs(tab.scene().astype(int) - whole).mean() < 1)
+        assert tab.value(f"{by_id.format('thing')}.hidden")
+
+
+def one_thing(outcome: Outcome) -> tuple[FoundThings, str]:
+    """The Gaussians of the map's largest class but walls, floor and ceiling, as a thing; and its name."""
+    cloud = map_cloud(outcome)
+    names = outcome.classes.names
+    counts = np.bincount(cloud.class_ids, minlength=len(names)) * [n not in STRUCTURE for n in names]
+    label, name = int(counts.argmax()), f"{names[int(counts.argmax())]} 1"
+    axes, size = ((1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0)), (1.0, 0.5, 0.8)
+    center = tuple(cloud.means[cloud.class_ids == label].mean(axis=0).tolist())
+    thing = Thing(1, name, label, 1.0, center, axes, size, (0.01,) * 3, 500, 0, 7, 0.65, size, (0.1, 0.05, 0.08))
+    return FoundThings((thing,), cloud.means, (cloud.class_ids == label).astype(np.uint16), 0.01), name
+
+
+def seen_from(outcome: Outcome, points: np.ndarray) -> tuple[int, tuple[float, float]]:
+    """The keyframe that sees most of the points, and the pixel of the one in their middle."""
+    k = outcome.calibration.intrinsics
+    best: tuple[int, int, tuple[float, float]] = (0, 0, (0.0, 0.0))
+    for row in np.flatnonzero(outcome.trajectory.is_keyframe).tolist():
+        pose = outcome.trajectory.cam_from_world[row]
+        shown = view_map(outcome.require_map(), outcome.label_of_channel, k, pose)
+        cam = points @ pose[:3, :3].T + pose[:3, 3]
+        u, v = (k.fx * cam[:, 0] / cam[:, 2] + k.cx, k.fy * cam[:, 1] / cam[:, 2] + k.cy)
+        inside = (cam[:, 2] > 0.1) & (u > 0) & (v > 0) & (u < k.width) & (v < k.height)
+        rows = np.flatnonzero(inside)
+        rows = rows[np.abs(shown.depth[v[rows].astype(int), u[rows].astype(int)] - cam[rows, 2]) < 0.05]
+        if len(rows) > best[1]:
+            middle = rows[np.hypot(u[rows] - np.median(u[rows]), v[rows] - np.median(v[rows])).argmin()]
+            best = row, len(rows), (float(u[middle]), float(v[middle]))
+    return best[0], best[2]
