@@ -133,6 +133,7 @@ def main() -> None:
     msgs-slam extend RUN more.mp4       extend a finished run with another video
     msgs-slam batch FOLDER --out RUNS   many recordings, on one machine or many
     msgs-slam status video.msgs         what is done, what was found
+    msgs-slam list video.msgs           the things that were found, with their sizes
     msgs-slam export video.msgs         write more kinds of files, or elsewhere
     msgs-slam report video.msgs         one HTML page: what was found, how good, what to film better
     msgs-slam render video.msgs out.mp4 the map along its camera path

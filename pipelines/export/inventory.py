@@ -27,7 +27,7 @@ from ..system.values import dataclass_from_json
 from ..system.wording import quoted
 from ..types import VOID, Array
 from .light import clustered
-from .things import STRUCTURE, find_things, is_word
+from .things import LARGEST, STRUCTURE, find_things, is_word
 
 _NAMED = 0.3
 """Share of a thing that bears a class's name, from which the thing is called so."""
@@ -156,6 +156,9 @@ def things_in(
     of_vertex = find_things(mesh, names, world.axes == "up")
     edge = np.linalg.norm(mesh.vertices[mesh.faces[:, 0]] - mesh.vertices[mesh.faces[:, 1]], axis=1)
     step, seen = float(np.median(edge)) if len(edge) else 0.0, _views(mesh, of_vertex, views)
+    if seen.any():  # what no view sees is a surface that was completed
+        renumbered = np.where(seen > 0, np.cumsum(seen > 0) - 1, -1)
+        of_vertex, seen = np.append(renumbered, -1)[of_vertex], seen[seen > 0]
     a, b, c = of_vertex[mesh.faces].T
     of_face = np.where((a == b) | (a == c), a, np.where(b == c, b, -1))
     parts = zip(_rows(of_vertex, len(seen)), _rows(of_face, len(seen)), seen.tolist(), strict=True)
@@ -259,7 +262,7 @@ class Surroundings:
             number=0, name=shape if label == VOID else self.names[label], label=label, class_share=round(share, 3),
             center=_plain(((low + high) / 2 @ axes) @ self.turn), axes=tuple(_plain(axis @ self.turn) for axis in axes),
             size=_plain(high - low), size_sd=_plain(np.full(3, self.step)), faces=len(faces), gaussians=0, views=views,
-            sure=round(area / (area + _HALF_SURE), 3),
+            sure=round(area / (area + _HALF_SURE) * min(1.0, LARGEST / max(area, 1e-9)), 3),
         )  # fmt: skip
 
 

@@ -39,6 +39,9 @@ long as the root of the smaller one's area (the more the shorter it is). Chosen 
 whiteroom_2, staircase and three made rooms."""
 _JOIN, _JOIN_AREA = 0.4, 2000.0
 """How readily patches are joined, by area in squared edges of the usual length."""
+LARGEST, _LESS, _CUTS = 0.6, 0.3, 3
+"""Area in squared heights of the room beyond which a group is cut again, how much less readily it is joined then, and
+how often."""
 _NAMED = 0.6
 """A patch is no structure where this share of it has the name of something else."""
 _CALLED, _MEETS = 0.5, 0.2
@@ -120,7 +123,7 @@ def find_things(mesh: MeshArrays, names: Sequence[str], is_upright: bool) -> NDA
     free = ~is_structure[first] & ~is_structure[second] & (panel[first] == panel[second])
     cost = np.where(panel[first] >= 0, 0, cost)[free]
     mass = np.maximum(parts.size / (parts.step**2 * _JOIN_AREA), 1e-3)
-    group = cut_graph(first[free], second[free], cost, mass, _JOIN)
+    group = _joined(parts, first[free], second[free], cost, mass)
     return _numbered(mesh, np.where(is_structure, -1, group)[parts.patch])
 
 
@@ -249,6 +252,18 @@ def _panels(parts: Parts, on_plane: NDArray[np.bool_], first: NDArray, second: N
         if size[number] > _FILLED * sides[0] * sides[1] and min(sides) > _SLENDER * max(sides):
             panel[patches] = number
     return panel
+
+
+def _joined(parts: Parts, first: NDArray, second: NDArray, cost: Array, mass: Array) -> NDArray[np.int64]:
+    """(P,) the group of each patch; groups that are larger than one thing are cut again, less readily joined."""
+    group, join = cut_graph(first, second, cost, mass, _JOIN), _JOIN
+    for _ in range(_CUTS):
+        large = np.bincount(group, parts.size)[group] > LARGEST * _height(parts) ** 2
+        join *= _LESS
+        inside = large[first] & (group[first] == group[second])
+        again = cut_graph(first[inside], second[inside], cost[inside], mass, join)
+        group = np.unique(np.where(large, again, -1) + (len(group) + 1) * group, return_inverse=True)[1]
+    return group
 
 
 def _numbered(mesh: MeshArrays, group: NDArray[np.int64]) -> NDArray[np.int64]:
