@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import itertools
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ...formats.errors import InputError
-from ...formats.ply import MeshArrays, read_mesh_ply, read_mesh_things
+from ...formats.ply import FARTHEST, MeshArrays, read_mesh_ply, read_mesh_things
 from ..geometry.posed_depth import PosedDepth
 from ..geometry.se3 import Similarity
 from ..run.folder import RunFolder
@@ -45,6 +46,8 @@ _SAME = 0.3
 """Overlap of two boxes, over their union, from which they are of one thing."""
 _MOST = 2_000_000
 """Faces in which things are looked for, in about 1 GB; a mesh with more is simplified for it."""
+_NUMBERED, _MOST_THINGS = re.compile(r".+ [1-9]\d{0,4}"), 65_535
+"""Name of a thing, and the largest number that the files hold."""
 _REACH = 4.0
 """Usual edges up to which a point belongs to the nearest vertex's thing."""
 
@@ -87,9 +90,22 @@ class Thing:
         return f"{' x '.join(f'{v:.2f}' for v in sizes)} {'m' if known else 'units'} ± {100 * min(share, 1):.0f}%"
 
 
+def _checked(thing: Thing) -> Thing:
+    """Raises ValueError for one that is not written here: its number is a place in arrays, its name is shown."""
+    numbered = thing.name.isprintable() and _NUMBERED.fullmatch(thing.name)
+    counts, metric = (thing.faces, thing.gaussians, thing.views), (thing.metres, thing.metres_sd)
+    rows = [thing.center, thing.size, thing.size_sd, *thing.axes, *(metric if thing.metres else ())]
+    lengths = [len(row) for row in rows]
+    if not numbered or not 0 < thing.number <= _MOST_THINGS or not 0 <= thing.label <= VOID or min(counts) < 0:
+        raise ValueError(f"thing {thing.name[:40]!r}: its name, number, class or a count is out of range")
+    if lengths not in ([3] * 6, [3] * 8) or max(map(abs, itertools.chain(*rows))) > FARTHEST:
+        raise ValueError(f"thing {thing.name[:40]!r}: a place or size of it is not three numbers within reach")
+    return thing
+
+
 THINGS: RunFile[tuple[Thing, ...]] = RunFile(
     "things.json", ("export",), "things",
-    lambda rows: tuple(dataclass_from_json(Thing, row) for row in rows),
+    lambda rows: tuple(_checked(dataclass_from_json(Thing, row)) for row in rows),
     lambda things: [asdict(thing) for thing in things],
 )  # fmt: skip
 

@@ -207,6 +207,21 @@ def test_the_command_lists_them(run: RunFolder) -> None:
     assert len(table) == 4
 
 
+@pytest.mark.parametrize(
+    "changed",
+    [{"number": 10**12}, {"number": 0}, {"name": "chair"}, {"name": "chair \x1b[2J 1"}, {"label": 300}, {"faces": -1},
+     {"center": [0, 0]}, {"axes": [[1, 0, 0]]}, {"size": [1e30, 1, 1]}, {"metres": [1.0]}],
+)  # fmt: skip
+def test_a_list_of_another_hand_is_refused(run: RunFolder, tmp_path: Path, changed: dict[str, object]) -> None:
+    rows = json.loads(run.file("export", "things.json").read_text())
+    table = tmp_path / "things.json"
+    table.write_text(json.dumps(rows))
+    THINGS.read(table)
+    table.write_text(json.dumps([rows[0] | changed, *rows[1:]]))
+    with pytest.raises(InputError, match="things"):
+        THINGS.read(table)
+
+
 def test_python_gives_each_its_mesh_and_its_gaussians(run: RunFolder) -> None:
     things = msgs_slam.open_run(run.root).things
     chair = next(t for t in things if t.name == "chair 1")
