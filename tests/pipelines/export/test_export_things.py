@@ -20,6 +20,7 @@ from msgs_slam.formats.ply import MeshArrays, MeshBlocks, read_mesh_ply, read_me
 from msgs_slam.msgs_cli.main import main
 from msgs_slam.pipelines.export.holes import cut_mesh
 from msgs_slam.pipelines.export.inventory import THINGS, Selection, in_metres, inventory_csv, things_in
+from msgs_slam.pipelines.export.kinds import EXPORTS
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.export.things import find_things
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -239,3 +240,15 @@ def test_a_lighter_mesh_has_a_node_for_each(run: RunFolder, tmp_path: Path) -> N
     assert set(mesh.things.tolist()) == set(read_mesh_things(tmp_path / "mesh.ply").tolist())
     names = set(trimesh.load(tmp_path / "mesh.glb").graph.nodes_geometry)
     assert {t.name for t in table} <= {name.removesuffix(", hidden") for name in names}
+
+
+@pytest.mark.parametrize("kind", [row.kind for row in EXPORTS if row.holds_things and row.kind != "usd"])
+def test_every_kind_that_holds_things_can_do_without(run: RunFolder, tmp_path: Path, kind: str) -> None:
+    paths = export_run(run, tmp_path, kind, without="chair")
+    assert len(paths) > 2
+    assert all(path.exists() for path in paths)
+    if kind == "collision":
+        points = trimesh.load(tmp_path / "collision.glb", force="mesh").vertices[:, [0, 2]] * (1, -1)
+        chair = (points > 3.05).all(axis=1) & (points < 3.45).all(axis=1)
+        heights = trimesh.load(tmp_path / "collision.glb", force="mesh").vertices[chair, 1]
+        assert np.abs(heights).max(initial=0) < 0.02
