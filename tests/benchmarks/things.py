@@ -1,15 +1,16 @@
 """Things against exact ones: how many of a room's objects the mesh has as one, whatever they are called.
 
     python tests/benchmarks/things.py RUN=TRUTH [RUN=TRUTH ...]           things of a run's mesh as it was exported
-    python tests/benchmarks/things.py RUN=TRUTH --again                   found anew in its mesh, as --classes too
+    python tests/benchmarks/things.py RUN=TRUTH --again                   found anew in its mesh
     python tests/benchmarks/things.py RUN=TRUTH --classes                 connected faces of one class: the simplest way
     python tests/benchmarks/things.py RUN=TRUTH --sheet DIR               the mesh from above: classes, things, truth
 
 RUN is a finished run, TRUTH a folder of made rooms (`python -m tests.benchmarks.rooms video DIR`) or of Replica, with
-the number of the thing that each pixel shows. The keyframes with truth tell it each vertex that they see, and a face is
-of the thing that two of its vertices are of; no alignment is needed. Walls, floors and ceilings are no things; faces of
-windows, doors and what has no name, and things of less than 100 faces, count neither for nor against. AP as ScanNet has
-it, without classes: surest things first, each may find one true thing by intersection over union of the faces' areas.
+the number of the thing that each pixel shows; of a data set with classes alone, connected faces of one stand for one.
+The frames with truth tell it each vertex that they see, and a face is of the thing that two of its vertices are of; no
+alignment is needed. Walls, floors and ceilings are no things; faces of windows, doors and what has no name, and things
+of less than 100 faces, count neither for nor against. AP as ScanNet has it, without classes: surest things first, each
+may find one true thing by intersection over union of the faces' areas.
 """
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
@@ -29,9 +30,10 @@ from numpy.typing import NDArray
 
 from msgs_slam.formats.datasets import open_sequence
 from msgs_slam.formats.images import write_rgb
-from msgs_slam.formats.ply import MeshArrays, read_mesh_ply
+from msgs_slam.formats.ply import MeshArrays, read_mesh_ply, read_mesh_things
 from msgs_slam.pipelines.evaluation.truth import match_outcome
 from msgs_slam.pipelines.evaluation.views import render_outcome
+from msgs_slam.pipelines.export.inventory import THINGS
 from msgs_slam.pipelines.export.surface import components
 from msgs_slam.pipelines.export.things import STRUCTURE, find_things
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
@@ -45,46 +47,41 @@ NO_THING, IGNORED = 0, -1
 LEAST_FACES = 100
 THRESHOLDS = (0.25, 0.5)
 _TOLERANCE = 0.03
-_NO_THINGS, _PARTS = ("wall", "floor", "ceiling"), ("window", "door", "undefined", "panel", "pillar", "blinds")
-"""Names of Replica's instances that are none, and of those that count neither way."""
+_NO_THINGS, _PARTS = ("wall", "floor", "ceiling"), ("window", "door", "undefined", "panel", "pillar", "blinds", "none")
+"""Names of what is no thing, and of what counts neither way."""
 _SIDE = 700
 
 
 class Truth:
-    """Numbers of things in the images of a data set: 0 none, -1 neither."""
+    """Numbers of things in the images of a data set: 0 none, -1 neither; where it has classes alone (`by_class`), those
+    that are things, from 1."""
 
     def __init__(self, folder: Path) -> None:
         self.sequence = open_sequence(folder)
-        self.by_class = False
-        self.table, self.images = np.arange(65536), folder / "things"
-        self.labels = folder / "labels" if self.images.exists() else None
-        if self.labels is None and not (folder / "semantic_instance").exists():
-            self.by_class = True
-        elif self.labels is None:
-            self.images = folder / "semantic_instance"
-            named = json.loads((folder / "info_semantic.json").read_text())["objects"]
-            names = {o["id"]: o["class_name"] for o in named}
-            kinds = [names.get(n, "undefined") for n in range(256)]
-            self.table = np.array([0 if k in _NO_THINGS else -1 if k in _PARTS else n for n, k in enumerate(kinds)])
+        self.made, self.replica = folder / "things", folder / "semantic_instance"
+        self.by_class = not (self.made.exists() or self.replica.exists())
+        self.of_class = np.full(256, IGNORED)
+        names = [name.lower() for name in self.sequence.class_names]
+        self.of_class[: len(names)] = [_kind(name, number + 1) for number, name in enumerate(names)]
+        if self.replica.exists():
+            objects = json.loads((folder / "info_semantic.json").read_text())["objects"]
+            named = {o["id"]: o["class_name"] for o in objects}
+            self.of_instance = np.array([_kind(named.get(n, "undefined"), n) for n in range(256)])
 
     def image(self, index: int) -> NDArray[np.int64]:
         """(H, W) of one image."""
+        name = f"{Path(self.sequence.names[index]).stem}.png"
+        if self.replica.exists():
+            return np.asarray(self.of_instance[cv2.imread(str(self.replica / name), cv2.IMREAD_UNCHANGED)])
+        kinds = self.of_class[self.sequence.labels(index)]
         if self.by_class:
-            label = self.sequence.labels(index)
-            names = np.array([c.lower() for c in self.sequence.class_names])
-            kinds = np.array(
-                [0 if n in _NO_THINGS else -1 if n in (*_PARTS, "none") else k + 1 for k, n in enumerate(names)]
-            )
-            return np.append(kinds, np.full(256 - len(kinds), IGNORED))[label]
-        name = Path(self.sequence.names[index]).stem
-        found = self.table[cv2.imread(str(self.images / f"{name}.png"), cv2.IMREAD_UNCHANGED)]
-        if self.labels is not None:
-            label = self.sequence.labels(index)
-            names = np.array([c.lower() for c in self.sequence.class_names])
-            found = np.where(
-                np.append(np.isin(names, _PARTS), np.ones(256 - len(names), bool))[label] & (found == 0), IGNORED, found
-            )
-        return np.asarray(found, np.int64)
+            return np.asarray(kinds)
+        found = cv2.imread(str(self.made / name), cv2.IMREAD_UNCHANGED).astype(np.int64)
+        return np.where((kinds == IGNORED) & (found == NO_THING), IGNORED, found)
+
+
+def _kind(name: str, number: int) -> int:
+    return NO_THING if name in _NO_THINGS else IGNORED if name in _PARTS else number
 
 
 def true_things(outcome: Outcome, world: World, mesh: MeshArrays, truth: Truth) -> NDArray[np.int64]:
@@ -124,6 +121,15 @@ def found_anew(mesh: MeshArrays, names: tuple[str, ...], is_upright: bool) -> tu
     a, b, c = (find_things(mesh, names, is_upright) + 1)[mesh.faces].T
     of_face = np.where((a == b) | (a == c), a, np.where(b == c, b, 0))
     return of_face, np.bincount(of_face)[1:].astype(float)
+
+
+def exported(run: RunFolder, mesh: MeshArrays) -> tuple[NDArray[np.int64], NDArray]:
+    """What the run's export holds: number from 1 of each face, 0 for none, and sureness."""
+    table = THINGS.read(run.file("export", THINGS.name))
+    place = np.zeros(1 + max((t.number for t in table), default=0), np.int64)
+    place[[t.number for t in table]] = np.arange(len(table)) + 1
+    a, b, c = place[read_mesh_things(run.file("export", "mesh.ply"))][mesh.faces].T
+    return np.where((a == b) | (a == c), a, np.where(b == c, b, 0)), np.array([t.sure for t in table])
 
 
 def by_classes(mesh: MeshArrays, names: tuple[str, ...]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -213,6 +219,8 @@ def main() -> None:
         begin = time.process_time()
         if arguments.classes:
             mine, sure = by_classes(mesh, outcome.classes.names)
+        elif not arguments.again:
+            mine, sure = exported(outcome.run, mesh)
         else:
             mine, sure = found_anew(mesh, outcome.classes.names, world.axes == "up")
         rows.append(precision(mine, sure, true, area) | {"CPU s": round(time.process_time() - begin, 1)})
