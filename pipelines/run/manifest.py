@@ -132,7 +132,7 @@ def finite_or_none(figures: Any) -> Any:
 
 
 def keyframe_psnr(records: Mapping[str, StageRecord]) -> float | None:
-    """The PSNR of a run, dB: mean over the keyframes that made the map, each drawn with its exposure at the size that
+    """The PSNR of a run, dB: mean over up to 16 keyframes of each submap, drawn with their exposures at the size that
     the map was made at, against what it shows of the scene; as the last stage that changed the map measured it. None
     before mapping is done."""
     figures = (records[name].figures for name in ("global_ba", "mapping") if name in records)
