@@ -109,18 +109,22 @@ def _density(vertices: NDArray[np.float32], normals: NDArray[np.float64], shot: 
     return np.where(seen, (shot.camera.fx * towards / np.where(seen, z, 1)).clip(0), 0)
 
 
-def _seen(atlas: Atlas, shot: Shot) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _seen(atlas: Atlas, shot: Shot) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """(H, W) of the photograph: depth of the mesh, and 0..1 how far from the rim of what shows it a pixel lies, in
-    units of `_FEATHER`. What the map knows in front of the mesh hides it, but no step that the map has a few pixels
-    beside the mesh's: painted by that, rims would have the colours of what is behind them."""
-    view, camera = shot.depth_view, shot.camera
-    mesh = draw_faces(atlas.mesh.vertices, atlas.mesh.faces, view.cam_from_world, camera).depth
+    units of `_FEATHER`; (F,) the faces that show, or have a corner in common with one that does. What the map knows in
+    front of the mesh hides it, but no step that the map has a few pixels beside the mesh's: painted by that, rims would
+    have the colours of what is behind them."""
+    view, camera, faces = shot.depth_view, shot.camera, atlas.mesh.faces
+    drawn = draw_faces(atlas.mesh.vertices, faces, view.cam_from_world, camera)
     known = np.where(view.trust > 0, view.depth, np.inf).astype(np.float32)
-    shows = (mesh > 0) & (resample_nearest(known, camera.height, camera.width) > (1 - _HIDDEN) * mesh)
+    shows = (drawn.face >= 0) & (resample_nearest(known, camera.height, camera.width) > (1 - _HIDDEN) * drawn.depth)
     if shot.hidden is not None:
         shows &= ~shot.hidden
+    touched = np.zeros(len(atlas.mesh.vertices), np.bool_)
+    touched[faces[drawn.face[shows]]] = True
     away = cv2.distanceTransform(np.pad(shows.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
-    return mesh, np.minimum(away / (_FEATHER * max(camera.width, camera.height)), 1).astype(np.float32)
+    trust = np.minimum(away / (_FEATHER * max(camera.width, camera.height)), 1).astype(np.float32)
+    return drawn.depth, trust, touched[faces].any(axis=1)
 
 
 def _in_bands(rows: int, task: Callable[[int, int], None]) -> None:
@@ -131,14 +135,9 @@ def _add(total: NDArray[np.float32], owner: NDArray[np.int32], atlas: Atlas, sho
     """Add what the shot shows at each texel, times its weight there."""
     pose, photo = shot.depth_view.cam_from_world, np.ascontiguousarray(shot.photo(), np.float32)
     in_cam = (atlas.mesh.vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])[atlas.corner_vertex]
-    camera, seen = np.array(shot.camera.numbers, np.float64), _seen(atlas, shot)
-    x, y, z = (in_cam * [*camera[:2], 1] + in_cam[:, 2:] * [*camera[2:], 0]).T
-    beyond = np.stack([x < 0, x > shot.camera.width * z, y < 0, y > shot.camera.height * z, z <= 0])
-    of_mesh = (atlas.corners, atlas.corner_faces, in_cam, ~beyond[:, atlas.corner_faces].all(2).any(0))
-    _in_bands(
-        atlas.height,
-        lambda a, b: _sample(total[a:b], owner[a:b], a, *of_mesh, photo, *seen, camera, shot.sharpness, POWER, _SAME),
-    )
+    camera, (depth, trust, shows) = np.array(shot.camera.numbers, np.float64), _seen(atlas, shot)
+    seen = (atlas.corners, atlas.corner_faces, in_cam, shows, photo, depth, trust, camera, shot.sharpness, POWER, _SAME)
+    _in_bands(atlas.height, lambda a, b: _sample(total[a:b], owner[a:b], a, *seen))
 
 
 @kernel
@@ -154,7 +153,7 @@ def _shares(x, y, corners, a, b, c):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sample(total, owner, top, corners, faces, in_cam, inside, photo, depth, trust, camera, sharpness, power, same):  # type: ignore[no-untyped-def]
+def _sample(total, owner, top, corners, faces, in_cam, shows, photo, depth, trust, camera, sharpness, power, same):  # type: ignore[no-untyped-def]
     rows, columns = owner.shape
     height, width = depth.shape
     fx, fy, cx, cy = camera
@@ -162,7 +161,7 @@ def _sample(total, owner, top, corners, faces, in_cam, inside, photo, depth, tru
     for row in range(rows):
         for column in range(columns):
             f = owner[row, column]
-            if f < 0 or not inside[f]:
+            if f < 0 or not shows[f]:
                 continue
             a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
             if f != last:
