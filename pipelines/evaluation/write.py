@@ -199,7 +199,7 @@ def evaluation_rows(result: dict[str, Any]) -> list[Row]:
     stated = "{stated:.4g} ± {relative sd:.1%}" + estimated
     rows.append(_row("metres per unit", result["scale"], stated, "true {true:.4g}, {sigmas:.1f} sigmas off"))
     if (psnr := result["keyframe psnr"]) is not None:
-        rows.append(("PSNR at keyframes", f"{psnr:.2f} dB", "as in status and report: of up to 16, at the map's own image size"))
+        rows.append(("PSNR at keyframes", f"{psnr:.2f} dB", "as in status and report: up to 16, as the map is made"))
     rows += _image_rows(result["images"], result["stage"]["map"])
     rows += _depth_rows(result["depth"]) + _label_rows(result["labels"])
     name = "mesh" if "missing" in result["mesh"] else "mesh accuracy, completeness, F-score"

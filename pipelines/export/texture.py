@@ -124,7 +124,7 @@ def _seen(atlas: Atlas, shot: Shot) -> tuple[NDArray[np.float32], NDArray[np.flo
     touched[faces[drawn.face[shows]]] = True
     away = cv2.distanceTransform(np.pad(shows.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
     trust = np.minimum(away / (_FEATHER * max(camera.width, camera.height)), 1).astype(np.float32)
-    return drawn.depth, trust, touched[faces].any(axis=1)
+    return drawn.depth, trust, np.asarray(touched[faces].any(axis=1))
 
 
 def _in_bands(rows: int, task: Callable[[int, int], None]) -> None:
