@@ -54,14 +54,14 @@ class Hole:
         return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
 
 
-def gone(choice: Selection, numbers: NDArray[np.uint16], labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def gone(selection: Selection, numbers: NDArray[np.uint16], labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """(N,) what is a thing, or of a class, that is not wanted, where the rest of the room stays."""
-    return np.zeros(len(numbers), bool) if choice.only else ~choice.keeps(numbers, labels)
+    return np.zeros(len(numbers), bool) if selection.only else ~selection.keeps(numbers, labels)
 
 
-def holes_in(mesh: MeshArrays, numbers: NDArray[np.uint16], choice: Selection, world: World) -> list[Hole]:
+def holes_in(mesh: MeshArrays, numbers: NDArray[np.uint16], selection: Selection, world: World) -> list[Hole]:
     """The floor and walls of the mesh (V,) where what goes hid them; none where up is unknown."""
-    away = gone(choice, numbers, mesh.labels)
+    away = gone(selection, numbers, mesh.labels)
     if world.axes != "up" or not away.any():
         return []
     points = mesh.vertices.astype(np.float64)
@@ -136,15 +136,15 @@ def _hole(
 
 
 def cut_mesh(
-    mesh: MeshArrays, numbers: NDArray[np.uint16], choice: Selection, world: World
+    mesh: MeshArrays, numbers: NDArray[np.uint16], selection: Selection, world: World
 ) -> tuple[MeshArrays, NDArray[np.uint16]]:
     """The faces whose corners are wanted, the holes filled, and the numbers of the vertices' things."""
-    kept = choice.keeps(numbers, mesh.labels)
+    kept = selection.keeps(numbers, mesh.labels)
     faces = mesh.faces[kept[mesh.faces].sum(axis=1) >= 2]
     used, corners = np.unique(faces, return_inverse=True)
     parts = [(mesh.vertices[used], corners.reshape(-1, 3), mesh.colors[used], mesh.labels[used])]
     held, count = [np.where(kept[used], numbers[used], 0)], len(used)
-    for hole in holes_in(mesh, numbers, choice, world):
+    for hole in holes_in(mesh, numbers, selection, world):
         corner, triangles = np.unique(hole.triangles(), return_inverse=True)
         colors = hole.colors.reshape(-1, 3)[corner]
         parts.append((
@@ -158,12 +158,12 @@ def cut_mesh(
     return made, np.concatenate(held).astype(np.uint16)
 
 
-def cut_light(mesh: ClassMesh, choice: Selection, holes: Sequence[Hole]) -> ClassMesh | None:
+def cut_light(mesh: ClassMesh, selection: Selection, holes: Sequence[Hole]) -> ClassMesh | None:
     """The faces that are wanted, and those of the holes, hidden ones, whose colours are added to the texture as grids;
     None where nothing is left."""
     things = np.zeros(len(mesh.labels), np.uint16) if mesh.things is None else mesh.things
     hidden = np.zeros(len(mesh.labels), bool) if mesh.hidden is None else mesh.hidden
-    kept = choice.keeps(things, mesh.labels)
+    kept = selection.keeps(things, mesh.labels)
     if not kept.any():
         return None
     made = replace(mesh, faces=mesh.faces[kept], labels=mesh.labels[kept], things=things[kept], hidden=hidden[kept])
@@ -203,13 +203,13 @@ def _with_hole(mesh: ClassMesh, hole: Hole) -> ClassMesh:
     )
 
 
-def cut_map(outcome: Outcome, numbers: NDArray[np.uint16], choice: Selection, holes: Sequence[Hole]) -> GaussianMap:
+def cut_map(outcome: Outcome, numbers: NDArray[np.uint16], selection: Selection, holes: Sequence[Hole]) -> GaussianMap:
     """The Gaussians that are wanted, by the numbers (M,) of their things, and new ones in the holes."""
     m, channels = outcome.require_map(), outcome.label_of_channel
     labels = None
     if len(channels):
         labels = channels[m.class_logits.argmax(dim=1).cpu().numpy()]
-    kept = m.only(torch.from_numpy(choice.keeps(numbers, labels)).to(m.means.device))
+    kept = m.only(torch.from_numpy(selection.keeps(numbers, labels)).to(m.means.device))
     parts = [kept, *(_filling(m, hole, channels) for hole in holes)]
     return GaussianMap(**{name: torch.cat([vars(part)[name] for part in parts]) for name in vars(m)})
 

@@ -56,7 +56,7 @@ def write_mesh(scene: ExportScene, target: Target) -> None:
     Files that are there stay. The tasks load the map themselves; what does not fit into memory is in the snapshot of
     the scene's context.
     """
-    if scene.choice is not None:
+    if scene.selection is not None:
         write_chosen(scene, target)
         return
     context, outcome, settings = scene.context, scene.outcome, scene.settings

@@ -33,14 +33,14 @@ _FREE = "The unit of lengths is free: one camera cannot measure metres. Metric d
 @dataclass(frozen=True)
 class ExportScene:
     """outcome: poses, map and points in the `world` of the exported files, and how long its unit is; context: settings,
-    threads, tasks and warnings of whoever exports; things: those of the mesh, as soon as there is one; choice: which of
-    them are wanted, by which the outcome's map is cut already."""
+    threads, tasks and warnings of whoever exports; things: those of the mesh, as soon as there is one; selection: which
+    of them are wanted, by which the outcome's map is cut already."""
 
     outcome: Outcome
     world: World
     context: StageContext
     things: FoundThings = NO_THINGS
-    choice: Selection | None = None
+    selection: Selection | None = None
 
     @property
     def settings(self) -> ExportConfig:
@@ -83,7 +83,7 @@ class ExportScene:
         mesh, numbers = mesh_of_run(self.outcome.run, self.world), self.things.numbers
         if not len(numbers):
             numbers = np.zeros(len(mesh.vertices), np.uint16)
-        return (mesh, numbers) if self.choice is None else cut_mesh(mesh, numbers, self.choice, self.world)
+        return (mesh, numbers) if self.selection is None else cut_mesh(mesh, numbers, self.selection, self.world)
 
     def light_mesh(self) -> ClassMesh | None:
         """Read the lighter mesh that the run's own export has made, z up, the things of it that are wanted; None where
@@ -95,10 +95,10 @@ class ExportScene:
         turned = mesh.vertices.astype(np.float64) @ own.gltf_from_exported
         move = self.world.exported_from_run @ own.exported_from_run.inverse()
         mesh = replace(mesh, vertices=move.apply(turned).astype(np.float32))
-        if self.choice is None:
+        if self.selection is None:
             return mesh
         whole = mesh_of_run(self.outcome.run, self.world)
-        return cut_light(mesh, self.choice, holes_in(whole, self.things.numbers, self.choice, self.world))
+        return cut_light(mesh, self.selection, holes_in(whole, self.things.numbers, self.selection, self.world))
 
     def without_map(self) -> "ExportScene":
         """Return the scene for writers that load the map themselves."""
@@ -154,8 +154,21 @@ def finished_scene(outcome: Outcome, context: StageContext) -> ExportScene:
     outcome = in_world(outcome, world)
     if outcome.metres is not None and outcome.metres.is_guess and settings.scale == "free":
         outcome = replace(outcome, metres=None)
-    things = things_of_run(outcome.run, world) or NO_THINGS
-    return ExportScene(outcome, world, context, things)
+    return ExportScene(outcome, world, context)
+
+
+def with_things(scene: ExportScene, selection: Selection | None) -> ExportScene:
+    """Return the scene with the things that the run's own export has found, or those of a selection alone; with a
+    warning without any where its mesh is damaged. Raises InputError where that leaves nothing to select from."""
+    try:
+        things = things_of_run(scene.outcome.run, scene.world) or NO_THINGS
+    except InputError as error:
+        if selection is not None:
+            raise
+        scene.warn(f"without its things: {error}")
+        return scene
+    scene = replace(scene, things=things)
+    return scene if selection is None else chosen_scene(scene, selection)
 
 
 def things_of_run(run: RunFolder, world: World) -> FoundThings | None:
@@ -168,14 +181,16 @@ def things_of_run(run: RunFolder, world: World) -> FoundThings | None:
     return found.moved(world.exported_from_run @ own.exported_from_run.inverse())
 
 
-def chosen_scene(scene: ExportScene, choice: Selection) -> ExportScene:
+def chosen_scene(scene: ExportScene, selection: Selection) -> ExportScene:
     """Return the scene with those things alone that are wanted, and floor and walls where others stood."""
     outcome = scene.outcome
     whole = mesh_of_run(outcome.run, scene.world)
-    cut = cut_map(outcome, scene.gaussian_things, choice, holes_in(whole, scene.things.numbers, choice, scene.world))
-    table = tuple(t for t in scene.things.table if (t.number in choice.numbers) == choice.only)
+    cut = cut_map(
+        outcome, scene.gaussian_things, selection, holes_in(whole, scene.things.numbers, selection, scene.world)
+    )
+    table = tuple(t for t in scene.things.table if (t.number in selection.numbers) == selection.only)
     things = replace(scene.things, table=table)
-    return replace(scene, outcome=replace(outcome, gaussian_map=cut), choice=choice, things=things)
+    return replace(scene, outcome=replace(outcome, gaussian_map=cut), selection=selection, things=things)
 
 
 def write_things(scene: ExportScene, target: Target, things: FoundThings) -> None:

@@ -54,11 +54,11 @@ from .kinds import EXPORTS, IMAGES, NOTES, PIECES, README, WORLD_NOTE, Export, E
 from .mesh import mesh_figures
 from .scene import (
     ExportScene,
-    chosen_scene,
     estimate_metres,
     find_world,
     finished_scene,
     lengths,
+    with_things,
     write_things,
     written_things,
 )
@@ -179,8 +179,8 @@ def export_run(
     """
     folder = export_folder(run, only) if folder is None else folder
     exports = [export_of(only)] if only else stage_exports(run)
-    choice = read_selection(run, only_things, without, run.load(CLASSES).names)
-    if choice is not None:
+    selection = read_selection(run, only_things, without, run.load(CLASSES).names)
+    if selection is not None:
         exports = [export for export in exports if export.holds_things]
         if not exports:
             raise InputError(f"{only} holds no things: leave out --only-things and --without, or choose another kind")
@@ -193,13 +193,14 @@ def export_run(
     outcome = load_outcome(run)
     config = replace(outcome.config, export=settings or outcome.config.export)
     scene = finished_scene(outcome, StageContext(run, Path(), config, Path(), progress or SilentProgress()))
-    scene = scene if choice is None else chosen_scene(scene, choice)
+    if any(export.holds_things for export in exports):
+        scene = with_things(scene, selection)
     with Target(folder, overwrite, _origin(scene)).replacing(names.__contains__) as staged:
         with tempfile.TemporaryDirectory(dir=staged.folder) as scratch:
             scene = replace(scene, context=replace(scene.context, folder=Path(scratch)))
             for export in exports:
                 export.writer()(scene, staged)
-        if only or choice is not None:
+        if only or selection is not None:
             write_world(scene, staged)
         else:
             write_notes(scene, staged, scene.outcome.metres)

@@ -252,3 +252,14 @@ def test_every_kind_that_holds_things_can_do_without(run: RunFolder, tmp_path: P
         chair = (points > 3.05).all(axis=1) & (points < 3.45).all(axis=1)
         heights = trimesh.load(tmp_path / "collision.glb", force="mesh").vertices[chair, 1]
         assert np.abs(heights).max(initial=0) < 0.02
+
+
+def test_a_damaged_mesh_takes_its_things_along_and_nothing_else(
+    run: RunFolder, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (run.stage("export") / "mesh.ply").write_bytes(b"ply")
+    export_run(run, tmp_path / "a", "ply")
+    assert "without its things: " in caplog.text
+    assert "thing" not in plyfile.PlyData.read(tmp_path / "a" / "point_cloud.ply")["vertex"].data.dtype.names
+    with pytest.raises(InputError, match=r"mesh\.ply is not as the program left it"):
+        export_run(run, tmp_path / "b", "ply", without="chair")
