@@ -237,7 +237,6 @@ def _sum_by_key(keys: NDArray[np.int64], values: NDArray[np.float64]) -> tuple[N
 # layout of a room ------------------------------------------------------------------------------------------------
 
 OTHER, FLOOR, CEILING, WALL, SURFACE = range(5)
-NAMES = {FLOOR: "floor", CEILING: "ceiling", WALL: "wall", SURFACE: "surface"}
 
 _HORIZONTAL = np.cos(np.radians(25))
 _VERTICAL = np.sin(np.radians(20))

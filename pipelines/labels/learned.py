@@ -17,7 +17,7 @@ from ..networks.session import Network, card_identity
 from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, class_colors
 from ..types import VOID, ClassTable, Frame
 from .named import NamedScene, NetworkClasses
-from .segments import SegmentLabels
+from .segments import Segments
 
 _SAMPLE = 20000
 _ROUNDS = 20
@@ -74,7 +74,7 @@ class OnnxLabels(SemanticsProvider):
         self.precompute(frames)
         self._learn(frames)
         if self._has_world(frames, depth_of):
-            segments = SegmentLabels(self._sequence, self._limit, self._progress)
+            segments = Segments(self._sequence, self._progress)
             vocabulary = NetworkClasses(self._names, self._void, self._limit)
             self._scene = NamedScene.gather(segments, frames, depth_of, self._probabilities, vocabulary)
             names, kept = self._scene.names, self._scene.kept

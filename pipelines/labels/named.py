@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +20,12 @@ from scipy.sparse.csgraph import connected_components
 from ..geometry.camera import resample_nearest, unproject_depth
 from ..geometry.sequence import Sequence, resample_linear
 from ..geometry.voxels import FLOOR, Gravity, Voxels, find, find_near, select_voxels, touching, voxel_keys
-from ..providers import DepthEstimate, LabelEstimate
-from ..types import Frame
-from .segments import SegmentLabels, cut_parts, cut_patches, label_pixels
+from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, class_colors
+from ..system.progress import Progress
+from ..types import VOID, ClassTable, Frame
+from .segments import Segments, cut_parts, cut_patches, label_pixels
+from .shape import NAMES as SHAPE_NAMES
+from .shape import RoomShape
 
 _LYING = frozenset({"floor", "rug", "carpet", "floor mat", "earth", "road", "sidewalk", "grass", "field", "path"})
 _OVERHEAD = frozenset({"ceiling"})
@@ -35,6 +39,10 @@ _ON_FLOOR = 0.25
 _AGAINST = float(np.exp(-2.0))
 """Probability left to a name that the geometry contradicts: normals of stereo depth err too. Factors e^-2 and e^-4 did
 equally well on two recordings."""
+
+_UNKNOWN_AS = ("wall", "floor")
+_BY_SHAPE = ("wall", "floor", "ceiling", "door", "seating", "table", "storage")
+"""Names that shape tells apart; windows, pictures and curtains are flat to it."""
 
 _ALIKE = (
     frozenset({"bed", "seating", "sofa", "armchair", "chair", "seat", "swivel chair", "bench", "ottoman", "stool"}),
@@ -62,43 +70,56 @@ class NetworkClasses:
     limit: int
 
 
+SHAPE_CLASSES = tuple(n for n in SHAPE_NAMES if n != "other")
+
+
 @dataclass(frozen=True)
 class NamedScene:
     """keys (V,) of voxels of `size`; share (V, K) probability of each of `names`; kept (K,) the network's class that
-    each name is, -1 for a numbered object."""
+    each name is, -1 for a numbered object; the room's shape."""
 
     size: float
     keys: NDArray[np.int64]
     share: NDArray[np.float32]
     names: tuple[str, ...]
     kept: NDArray[np.int64]
+    room: RoomShape
 
     @staticmethod
     def gather(
-        segments: SegmentLabels,
+        segments: Segments,
         frames: list[Frame],
         depth_of: Callable[[Frame], DepthEstimate],
-        probabilities_of: Callable[[Frame], NDArray[np.float32]],
+        probabilities_of: Callable[[Frame], NDArray[np.float32]] | None,
         vocabulary: NetworkClasses,
     ) -> NamedScene:
-        """All frames vote; `probabilities_of` gives (rows, columns, C) over the frame's image, 0 for nothing said."""
+        """All frames vote; `probabilities_of` gives (rows, columns, C) over the frame's image, 0 for nothing said.
+        Without it shape alone says what things are, and `vocabulary` has its names."""
         sequence = segments.sequence
         voxels, gravity, kind = segments.structure(frames, depth_of)
-        votes = np.zeros((len(voxels), len(vocabulary.names) + 1), np.float32)
+        posed = [f for f in frames if f.id in sequence.cam_from_world]
+        centres = np.array([np.linalg.inv(sequence.cam_from_world[f.id])[:3, 3] for f in posed])
+        room, patch = RoomShape.of(voxels, gravity, kind, centres), cut_patches(voxels)
+        votes, by_shape = (
+            np.zeros((len(voxels), len(names) + 1), np.float32) for names in (vocabulary.names, SHAPE_NAMES)
+        )
         elsewhere = np.zeros(len(vocabulary.names))
-        for frame in frames:
-            if frame.id in sequence.cam_from_world:
-                elsewhere += _vote(votes, sequence, voxels, frame, depth_of(frame), probabilities_of(frame)) / len(
-                    frames
-                )
-        share = _agreed(votes, cut_patches(voxels))
-        centres = [np.linalg.inv(pose)[:3, 3] for pose in sequence.cam_from_world.values()]
-        eye = float(np.median(np.array(centres) @ gravity.up))
-        share *= name_likelihood(vocabulary.names, voxels, gravity, kind, eye)
-        share /= np.maximum(share.sum(1, keepdims=True), 1e-9)
+        for frame in posed:
+            depth = depth_of(frame)
+            shape = room.probabilities(sequence, frame, depth)
+            outside = _vote(by_shape, sequence, voxels, frame, depth, shape)
+            if probabilities_of is not None:
+                outside = _vote(votes, sequence, voxels, frame, depth, probabilities_of(frame))
+            elsewhere += outside / len(frames)
+        share = _agreed(by_shape, patch)
+        if probabilities_of is not None:
+            shape, share = share, _agreed(votes, patch)
+            share *= name_likelihood(vocabulary.names, voxels, gravity, kind, float(np.median(centres @ gravity.up)))
+            share /= np.maximum(share.sum(1, keepdims=True), 1e-9)
+            recognise(share, vocabulary.names, shape)
         one_name_each(share, vocabulary.names, voxels)
         columns, names, kept = _settle(share, voxels, vocabulary, elsewhere)
-        return NamedScene(voxels.size, voxels.keys, columns, names, kept)
+        return NamedScene(voxels.size, voxels.keys, columns, names, kept, room)
 
     def estimate(
         self, sequence: Sequence, frame: Frame, depth: DepthEstimate, own: NDArray[np.float32]
@@ -217,6 +238,20 @@ def _things(
         yield members, inside, np.where(agrees, votes.argmax(1), -1)[thing]
 
 
+def recognise(share: NDArray[np.float32], names: tuple[str, ...], by_shape: NDArray[np.float32]) -> None:
+    """Give of what a network calls wall or floor, as it does with what it does not know, to each of the names that
+    shape tells apart the part that it gets by shape (V, SHAPE_NAMES). share (V, C) is changed in place; a network that
+    has not all of these names, but finer ones, is left alone."""
+    if not {*_BY_SHAPE} <= {*names}:
+        return
+    before = {name: share[:, names.index(name)].copy() for name in _UNKNOWN_AS}
+    for called, said in before.items():
+        for name in _BY_SHAPE:
+            part = said * by_shape[:, SHAPE_NAMES.index(name)]
+            share[:, names.index(called)] -= part
+            share[:, names.index(name)] += part
+
+
 def _touching(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     """(V,) number of the connected piece of each of the sorted keys."""
     a, b = touching(keys)
@@ -250,3 +285,42 @@ def name_likelihood(
         factor[np.ix_(against[kinds], named)] *= _AGAINST
     factor[np.ix_(is_floor, ~lying)] *= _AGAINST
     return factor
+
+
+class ShapeLabels(SemanticsProvider):
+    """Classes without a download, by shape; what has none becomes numbered objects. Needs poses (a backbone)."""
+
+    name = "segments"
+    shared_state = ("_scene",)
+
+    def __init__(self, sequence: Sequence, limit: int, progress: Progress) -> None:
+        """`limit` classes at the most. Raises InputError without a backbone."""
+        self._segments, self._limit = Segments(sequence, progress), limit
+        self._scene: NamedScene | None = None
+
+    def missing(self, frames: list[Frame]) -> list[Frame]:
+        """The frames without a pose."""
+        return [f for f in frames if f.id not in self._segments.sequence.cam_from_world]
+
+    def fit(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
+        """Let all frames vote on the names of the places they see."""
+        vocabulary = NetworkClasses(SHAPE_NAMES, (SHAPE_NAMES.index("other"),), self._limit)
+        self._scene = NamedScene.gather(self._segments, frames, depth_of, None, vocabulary)
+
+    def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
+        """Votes of the voxels under the pixels, spread along like colours to where the depth is unsure."""
+        assert self._scene is not None
+        sequence = self._segments.sequence
+        if frame.id not in sequence.cam_from_world or not self._scene.names:
+            return LabelEstimate(np.full(depth.depth.shape, VOID, np.uint8), np.zeros(depth.depth.shape, np.float32))
+        own = self._scene.room.probabilities(sequence, frame, depth)
+        return self._scene.estimate(sequence, frame, depth, own)
+
+    def classes(self) -> ClassTable:
+        """The names that occur, then the objects by size."""
+        assert self._scene is not None
+        return ClassTable(self._scene.names, class_colors(self._scene.names))
+
+    def figures(self) -> dict[str, Any]:
+        """The names that it knows, whether or not they occur."""
+        return {"vocabulary": [*SHAPE_CLASSES]}

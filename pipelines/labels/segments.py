@@ -1,42 +1,32 @@
-"""Classes without any learned model: regions of the reconstructed scene, named by geometry where that is sure.
-
-All frames' depths are gathered in one grid of voxels, the grid is cut into floor, ceiling, walls, surfaces and parts
-(graph-based segmentation, Felzenszwalb and Huttenlocher, IJCV 2004), and every frame reads its labels from the grid.
-So a class means the same in the whole video.
-"""
+"""Regions of the reconstructed scene: all frames' depths are gathered in one grid of voxels, and the grid is cut into
+parts and patches (graph-based segmentation, Felzenszwalb and Huttenlocher, IJCV 2004)."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ..depth.completion.fill import domain_transform_in_place
-from ..geometry.camera import resample_nearest, unproject_depth
+from ..geometry.camera import resample_nearest
 from ..geometry.sequence import Sequence
 from ..geometry.voxels import (
     MIN_WEIGHT,
-    NAMES,
-    OTHER,
     VOXELS_PER_DEPTH,
     Gravity,
     Voxels,
     find_gravity,
-    find_near,
     floor_plane,
     gather_frame,
     merge,
     name_structure,
-    select_voxels,
     touching,
-    voxel_keys,
 )
-from ..providers import DepthEstimate, LabelEstimate, SemanticsProvider, class_colors
+from ..providers import DepthEstimate, LabelEstimate
 from ..system.jit import kernel
 from ..system.machine import release_free_memory
 from ..system.progress import Progress
-from ..types import VOID, ClassTable, Frame
+from ..types import VOID, Frame
 
 _COLOR_UNIT = 12.0
 """Difference in CIE Lab that counts as much as a right angle between the normals."""
@@ -53,37 +43,19 @@ _COLOR_SD = 40.0
 _MIN_VOTE = 1e-3
 
 
-class SegmentLabels(SemanticsProvider):
-    """Unsupervised regions; needs poses (a backbone), because they make the regions consistent over the video."""
+class Segments:
+    """The surface that all frames with a pose show together."""
 
-    name = "segments"
-    shared_state = ("_size", "_keys", "_label", "_classes")
-
-    def __init__(self, sequence: Sequence, limit: int, progress: Progress) -> None:
-        """`limit` classes at the most. Raises InputError without a backbone."""
+    def __init__(self, sequence: Sequence, progress: Progress) -> None:
+        """Raises InputError without a backbone."""
         if not sequence.cam_from_world:
             raise InputError(
                 "regions of the scene need camera poses, and structure from motion found none: the camera stands still "
                 "or only turns. Move it sideways, or give classes with --semantics files:FOLDER or onnx:CARD"
             )
-        self.sequence, self._limit, self._progress = sequence, limit, progress
+        self.sequence, self._progress = sequence, progress
         self._size = 1.0
-        self._keys = np.empty(0, np.int64)
-        self._label = np.empty(0, np.uint8)
-        self._classes = ClassTable((), ())
-        self._gravity: list[float] = []
         self._world_from_cam = {k: np.linalg.inv(v).astype(np.float64) for k, v in sequence.cam_from_world.items()}
-
-    def missing(self, frames: list[Frame]) -> list[Frame]:
-        """The frames without a pose."""
-        return [f for f in frames if f.id not in self._world_from_cam]
-
-    def fit(self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]) -> None:
-        """Gather all frames and cut the scene."""
-        voxels, gravity, kind = self.structure(frames, depth_of)
-        self._name(kind, cut_parts(select_voxels(voxels, kind == OTHER), self._limit - len(NAMES) - 1))
-        self._keys = voxels.keys
-        self._gravity = [round(float(v), 4) for v in gravity.up] if gravity.is_sure else []
 
     def structure(
         self, frames: list[Frame], depth_of: Callable[[Frame], DepthEstimate]
@@ -120,47 +92,6 @@ class SegmentLabels(SemanticsProvider):
             self._size,
             None if estimate.normals is None else resample_nearest(estimate.normals, small.height, small.width),
         )
-
-    def _name(self, kind: NDArray[np.int64], parts: NDArray[np.int64]) -> None:
-        """Number the kinds that occur, then the parts, largest first; what is left over is the class "other"."""
-        label = np.full(len(kind), VOID, np.uint8)
-        names: list[str] = []
-        for k, name in NAMES.items():
-            if (kind == k).any():
-                label[kind == k] = len(names)
-                names.append(name)
-        own = np.full(len(parts), VOID, np.uint8)
-        for part in range(int(parts.max(initial=-1)) + 1):
-            own[parts == part] = len(names)
-            names.append(f"object {part + 1}")
-        if (own == VOID).any():
-            own[own == VOID] = len(names)
-            names.append("other")
-        label[kind == OTHER] = own
-        self._label = label
-        self._classes = ClassTable(tuple(names), class_colors(names))
-
-    def estimate(self, frame: Frame, depth: DepthEstimate) -> LabelEstimate:
-        """Votes of the voxels under the pixels, spread along like colours to where the depth is unsure."""
-        camera = self.sequence.intrinsics
-        if frame.id not in self._world_from_cam or len(self._keys) == 0:
-            return LabelEstimate(np.full(depth.depth.shape, VOID, np.uint8), np.zeros(depth.depth.shape, np.float32))
-        world_from_cam = self._world_from_cam[frame.id]
-        points = unproject_depth(depth.depth, camera) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
-        at = find_near(self._keys, voxel_keys(points, self._size))
-        label = np.where((at >= 0) & (depth.depth > 0), self._label[at], VOID)
-        votes = np.zeros((*label.shape, len(self._classes)), np.float32)
-        rows, columns = np.nonzero(label != VOID)
-        votes[rows, columns, label[rows, columns]] = 1
-        return label_pixels(votes, depth.confidence, self.sequence.image(frame))
-
-    def classes(self) -> ClassTable:
-        """Named structure first, then the objects by size."""
-        return self._classes
-
-    def figures(self) -> dict[str, Any]:
-        """The up direction in the world, when a dominant plane made it sure."""
-        return {"up": self._gravity} if self._gravity else {}
 
 
 def label_pixels(votes: NDArray[np.float32], trust: NDArray[np.float32], image: NDArray[np.uint8]) -> LabelEstimate:

@@ -18,8 +18,8 @@ from ..config import Config
 from ..depth.fused import DepthScale
 from ..geometry.camera import unproject
 from ..geometry.sequence import resize_area
-from ..labels.segments import SegmentLabels
-from ..providers import MAX_CLASSES, DepthEstimate, DepthProvider
+from ..labels.segments import Segments
+from ..providers import DepthEstimate, DepthProvider
 from ..run.files import BACKBONE, GIVEN_POSES
 from ..run.folder import RunFolder
 from ..sfm.flow import follow
@@ -123,7 +123,7 @@ def reference_scale(work: ProxyWork, frames: list[Frame], scale: DepthScale) -> 
         spread = 1.4826 * float(np.median(np.abs(lengths / np.median(lengths) - 1)))
         relative_sd = np.hypot(spread, np.median(pixel_sds))
     else:
-        segments = SegmentLabels(work.sequence, MAX_CLASSES, work.context.progress)
+        segments = Segments(work.sequence, work.context.progress)
         lengths = segments.heights(frames, lambda frame: scale.in_backbone_unit(work.depth(frame))) * scale.value
         if len(lengths) == 0 or np.median(lengths) <= 0:
             raise InputError(f"--scale-ref {text}: no floor was found in the scene. Give a distance between two points")

@@ -28,7 +28,7 @@ from ..types import Calibration, Frame, Intrinsics
 
 if TYPE_CHECKING:
     from ..depth.stereo.provider import MultiviewDepth
-    from ..labels.segments import SegmentLabels
+    from ..labels.named import ShapeLabels
 
 LEARNED_SPREAD = 0.02
 """Files whose depths stray by more from the triangulated points, relatively and within one frame, are taken for a
@@ -203,10 +203,10 @@ def _multiview(around: ProviderContext) -> MultiviewDepth:
     )
 
 
-def _segments(around: ProviderContext) -> SegmentLabels:
-    from ..labels.segments import SegmentLabels
+def _segments(around: ProviderContext) -> ShapeLabels:
+    from ..labels.named import ShapeLabels
 
-    return SegmentLabels(around.sequence, MAX_CLASSES, around.progress)
+    return ShapeLabels(around.sequence, MAX_CLASSES, around.progress)
 
 
 OWN_DEPTH: dict[str, Callable[[ProviderContext], DepthProvider]] = {"multiview": _multiview}

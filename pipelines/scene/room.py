@@ -220,7 +220,8 @@ def sizes_of_things(scene: Scene) -> list[Evidence]:
         return []
     heights = (scene.voxels.position - scene.floor.point) @ scene.floor.normal
     upward = scene.voxels.normal @ scene.floor.normal
-    named = _tops(scene, heights, upward) + _doors(scene, heights, upward)
+    # Names by shape alone go by heights themselves.
+    named = _tops(scene, heights, upward) + _doors(scene, heights, upward) if scene.is_named else []
     return named or _surfaces(scene, heights)
 
 

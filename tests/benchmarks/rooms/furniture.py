@@ -27,6 +27,22 @@ _UNWANTED = re.compile(
     r"|rabbit|horse|mannequin|water$",
     re.IGNORECASE,
 )
+_KINDS = {
+    "lamp": r"lamp|light|lantern|candle|spotlight",
+    "plant": r"plant|cactus|yucca|vase|pottery",
+    "screen": r"^tv 16|flat tv|screen|imac|ibook|laptop|^tablet",
+    "bed": r"\bbed\b|crib|mattress|futon$|tatami|sleeping bag",
+    "seating": r"chair|sofa|couch|seat|stool|(?<!work)bench$|puff|living room",
+    "floor": r"rug|carpet|mat$",
+    "curtain": r"curtain|blind|towel|hanging clothes|dress$|suit$|jacket|trousers|skirt",
+    "picture": r"white board|frame|calendar|dart game",
+    "table": r"table(?! tennis bat)|desk|^island(?! bath)|workbench",
+    "storage": r"bookcase|shelves|cabinet|cupboard|wardrobe|drawers|chest(?! freezer)|box$|locker|tv stand"
+    r"|basket(?!ball)|crate|rack$|vanity|dresser|safe",
+    "appliance": r"fridge|freezer|oven|cook(er|top)|stove|hood|machine|dryer|boiler|heater|radiator|sink|basin|bath"
+    r"|shower|toilet|bidet|urinal|lavatory|fireplace|furnace|chimney|air conditioning|microwave|refrigerator",
+}
+"""What is in the names of the pieces of a class; the first that is there counts."""
 _MOST_TRIANGLES = 24_000
 _GREY = (0.7, 0.7, 0.7)
 
@@ -47,6 +63,11 @@ class Piece:
     places: NDArray[np.float32]
     material: NDArray[np.int32]
     materials: list[tuple[tuple[float, float, float], int]]
+
+    @property
+    def kind(self) -> str:
+        """Its class; "thing" for what is of none."""
+        return next((k for k, words in _KINDS.items() if re.search(words, self.name, re.IGNORECASE)), "thing")
 
 
 @dataclass(frozen=True)

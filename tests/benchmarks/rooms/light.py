@@ -23,9 +23,9 @@ Array = NDArray[np.float32]
 
 
 class LitRoom:
-    """The triangles with their light; casts rays."""
+    """The triangles with their light; casts rays. Where it is not `lit` it can `cast`, `measure` and find distances."""
 
-    def __init__(self, surfaces: Surfaces) -> None:
+    def __init__(self, surfaces: Surfaces, lit: bool = True) -> None:
         from embreex import rtcore_scene
         from embreex.mesh_construction import TriangleMesh
 
@@ -49,8 +49,9 @@ class LitRoom:
         self.emission = np.array([m.emission for m in surfaces.materials], np.float32)
         self.gloss = np.array([m.gloss for m in surfaces.materials], np.float32)
         self.lights = surfaces.lights
-        self._store_textures(surfaces)
-        self.light = self._bake()
+        if lit:
+            self._store_textures(surfaces)
+            self.light = self._bake()
 
     def _store_textures(self, surfaces: Surfaces) -> None:
         """Textures with all their smaller levels in one array; the mean colour of each material."""

@@ -44,6 +44,7 @@ class _Builder:
 def build_piece(surfaces: Surfaces, kind: str, style: Style, frame: Array, r: Random) -> None:
     """Add a piece whose back stands at the frame's origin."""
     box = _Builder(surfaces, frame, style)
+    surfaces.of_class(_CLASS_OF.get(kind, "thing"))
     if kind in _KINDS:
         _KINDS[kind](box, style, r)
     else:
@@ -178,13 +179,15 @@ def _lamp(box: _Builder, style: Style, r: Random) -> None:
     x, z, rod, shade = w / 2, d / 2, r.uniform(0.008, 0.02), r.uniform(0.2, 0.35)
     box(x - 0.12, 0, z - 0.12, x + 0.12, 0.02, z + 0.12, style.third)
     box(x - rod, 0, z - rod, x + rod, h, z + rod, style.third)
-    surfaces, glow = box.surfaces, np.array([1.0, 0.85, 0.6]) * r.uniform(0.5, 3)
-    surfaces.of_class("lamp")
-    box(0, h - shade, 0, w, h, d, surfaces.material((0.8, 0.75, 0.65), emission=glow))
-    surfaces.of_class("furniture")
+    glow = np.array([1.0, 0.85, 0.6]) * r.uniform(0.5, 3)
+    box(0, h - shade, 0, w, h, d, box.surfaces.material((0.8, 0.75, 0.65), emission=glow))
 
 
 _KINDS: dict[str, Callable[[_Builder, Style, Random], None]] = {
     "cupboard": _cupboard, "shelf": _shelf, "table": _table, "desk": _desk, "chair": _chair, "bed": _bed,
     "sofa": _sofa, "radiator": _radiator, "rail": _rail, "curtain": _curtain, "lamp": _lamp,
+}  # fmt: skip
+_CLASS_OF = {
+    "cupboard": "storage", "shelf": "storage", "box": "storage", "table": "table", "desk": "table", "bed": "bed",
+    "chair": "seating", "sofa": "seating", "radiator": "appliance", "curtain": "curtain", "lamp": "lamp",
 }  # fmt: skip

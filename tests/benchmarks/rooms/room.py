@@ -227,7 +227,6 @@ class _Furnisher:
         if room.kind in ("home", "office"):
             for _ in range(int(r.integers(4, 14))):
                 self._in_the_room()
-        self.s.of_class("thing")
         for frame, w, h, d in room.tops:
             for _ in range(int(r.poisson(1.6))):
                 self._on_top(frame, w, h, d)
@@ -247,10 +246,12 @@ class _Furnisher:
 
     def put(self, what: str | Piece, frame: Array, style: Style | None = None, scale: float = 1.0) -> None:
         """Add a thing whose back stands at the frame's origin."""
-        self.s.new_thing()
         if isinstance(what, str):
+            self.s.new_thing()
             build_piece(self.s, what, style or self.style(what), frame, self.r)
             return
+        self.s.of_class(what.kind)
+        self.s.new_thing()
         recolored, numbers = self.r.random() < 0.5, []
         for rgb, texture in what.materials:
             own = color(self.r, "thing") if recolored else np.array(rgb)
@@ -273,7 +274,6 @@ class _Furnisher:
         mx, mz = x + fx * d / 2, z + fz * d / 2
         if not self.room.is_free(mx - a, mz - b, mx + a, mz + b, gap):
             return None
-        self.s.of_class("furniture")
         frame = standing(x, 0, z, angle)
         self.put(what, frame, style)
         self.room.taken.append((mx - a, mz - b, mx + a, mz + b))
@@ -330,6 +330,7 @@ class _Furnisher:
         wall = self.room.walls[0]
         w = min(r.uniform(2, 4), wall.length - 0.4)
         u, board = (wall.length - w) / 2, self.s.material(linear(color(r, "thing") * 255))
+        self.s.of_class("picture")
         self.s.new_thing()
         self.s.box((u, 0.85, 0.0), (u + w, 2.0, 0.03), board, wall.frame)
 
@@ -361,12 +362,14 @@ class _Furnisher:
         self.s.new_thing()
         if dice < 0.65:
             t, rim = r.uniform(0.01, 0.04), r.uniform(0, 0.05)
+            self.s.of_class("picture")
             self.s.box((u, v, 0), (u + w, v + h, t), thing_material(self.s, r), frame)
             corner = frame @ np.array([u + rim, v + rim, t + 0.002, 1])
             shown = self.s.material((1, 1, 1), picture(r, self.room.catalogue.textures), gloss=r.choice([0, 0, 0.08]))
             a, b = wall.along * (w - 2 * rim), UP * (h - 2 * rim)
             self.s.quad(corner[:3], a, b, shown, [(0, 1), (1, 1), (1, 0), (0, 0)])
         elif dice < 0.8 or not self.hung:
+            self.s.of_class("storage")
             self.s.box((u, v, 0), (u + w, v + 0.03, r.uniform(0.15, 0.3)), thing_material(self.s, r), frame)
         else:
             piece = self.hung[r.integers(len(self.hung))]
@@ -380,5 +383,6 @@ class _Furnisher:
         image, span = (carpet, paper)[r.integers(2)](r, color(r, "thing"))
         if r.random() < 0.4:
             image, span = picture(r, self.room.catalogue.textures), 2.0
+        self.s.of_class("floor")
         self.s.new_thing()
         self.s.box((x, 0, z), (x + w, 0.012, z + d), self.s.material((1, 1, 1), image, span))

@@ -9,8 +9,11 @@ from numpy.typing import NDArray
 
 from .textures import Random
 
-CLASSES = ("wall", "floor", "ceiling", "window", "door", "furniture", "thing", "lamp")
-FIRST_OF_THINGS = CLASSES.index("furniture")
+CLASSES = (
+    "wall", "floor", "ceiling", "window", "door", "thing", "lamp", "seating", "table", "bed", "storage", "curtain",
+    "picture", "screen", "appliance", "plant",
+)  # fmt: skip
+FIRST_OF_THINGS = CLASSES.index("thing")
 Array = NDArray[np.float64]
 UP = np.array([0.0, 1.0, 0.0])
 THICK = 0.14
@@ -250,18 +253,18 @@ def _hang_door(s: Surfaces, frame: Array, corner: Array, a: Array, b: Array, tri
 def _room_behind(s: Surfaces, frame: Array, width: float, height: float, trim: Trim, r: Random) -> None:
     """An open door: a bare room of its own light behind, with a box or two, and the leaf turned into it."""
     side, deep, top = r.uniform(0.4, 1.5), r.uniform(1.5, 4), max(2.4, height + 0.2)
-    s.of_class("wall")
     low, high = np.array([-side, 0, -deep]), np.array([width + side, top, -0.01])
     for axis, far, a, b in ((0, 0, 2, 1), (0, 1, 2, 1), (1, 0, 0, 2), (1, 1, 0, 2), (2, 0, 0, 1)):
         corner, first, second = low.copy(), np.zeros(3), np.zeros(3)
         corner[axis] = (low, high)[far][axis]
         first[a], second[b] = (high - low)[a], (high - low)[b]
         material = (trim.frame, trim.door)[axis == 1 and not far]
+        s.of_class("wall" if axis != 1 else "ceiling" if far else "floor")
         s.quad(frame[:3, :3] @ corner + frame[:3, 3], frame[:3, :3] @ first, frame[:3, :3] @ second, material)
     glow = np.full(3, r.uniform(1, 8))
     middle = frame[:3, :3] @ np.array([width / 2 - 0.3, top - 0.03, -deep / 2]) + frame[:3, 3]
     s.quad(middle, frame[:3, 0] * 0.6, frame[:3, 2] * 0.6, s.material((0.5,) * 3, emission=glow), light=glow)
-    s.of_class("furniture")
+    s.of_class("storage")
     for _ in range(int(r.integers(0, 3))):
         x, w, h = r.uniform(-side, width), r.uniform(0.2, 0.8), r.uniform(0.3, 1.8)
         s.box((x, 0, -deep), (x + w, h, -deep + r.uniform(0.2, 0.6)), trim.door, frame)

@@ -97,3 +97,24 @@ def check_film(lit: object, walk: object, folder: Path) -> None:
         away = np.linalg.norm(path[:, :3, 3] - pose[:3, 3], axis=1)
         assert 0.02 < away.min() < ASIDE + 0.01
     assert len(list((folder / "one" / "depth").glob("*.png"))) == -(-len(path) // 6)
+
+
+def test_a_room_is_shown_as_the_network_of_shapes_learns_it() -> None:
+    """Floor and walls are where the channels have them; a depth that is made wrong stays one."""
+    pytest.importorskip("embreex")
+    from msgs_slam.pipelines.labels.shape import CHANNELS, NAMES
+    from tests.benchmarks.names_by_shape import examples, see_room
+
+    views = see_room(50_000, NO_FURNITURE)
+    assert views is not None
+    found = examples(views, 50_000)
+    channels, names = found["channels"].astype(np.float32), found["names"]
+    assert channels.shape[:2] == (len(names), CHANNELS)
+    assert np.isfinite(channels).all()
+    known = channels[:, 1] > 0
+    for name, slope in (("floor", 1.0), ("wall", 0.0), ("ceiling", -1.0)):
+        there = known & (names == NAMES.index(name))
+        if there.sum() > 500:
+            assert np.median(channels[:, 6][there]) == pytest.approx(slope, abs=0.05)
+    on_floor = known & (names == NAMES.index("floor"))
+    assert np.median(np.abs(channels[:, 4][on_floor] + 1)) < 0.05

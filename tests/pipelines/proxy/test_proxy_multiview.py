@@ -18,7 +18,7 @@ from msgs_slam.pipelines.depth.stereo import provider as stereo_provider
 from msgs_slam.pipelines.depth.stereo.consistency import sweep_range
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
 from msgs_slam.pipelines.geometry.sequence import Sequence
-from msgs_slam.pipelines.labels.segments import SegmentLabels
+from msgs_slam.pipelines.labels.named import ShapeLabels
 from msgs_slam.pipelines.providers import DepthEstimate
 from msgs_slam.pipelines.proxy.maps import mean_iou
 from msgs_slam.pipelines.proxy.selection import ProviderContext, open_depth
@@ -111,7 +111,7 @@ def test_multiview_without_parallax_says_so(room: Room) -> None:
     with pytest.raises(InputError, match="parallax"):
         MultiviewDepth(still, SIDE, PLANES, lambda: Path("nowhere"), 1, SilentProgress())
     with pytest.raises(InputError, match="poses"):
-        SegmentLabels(still, 16, SilentProgress())
+        ShapeLabels(still, 16, SilentProgress())
 
 
 class Learned:
@@ -244,7 +244,7 @@ def test_regions_mean_the_same_in_all_frames_and_know_the_floor(room: Room) -> N
         for f in room.frames
     }
     sequence = room.sequence()
-    segments = SegmentLabels(sequence, 16, SilentProgress())
+    segments = ShapeLabels(sequence, 16, SilentProgress())
     segments.fit(room.frames, lambda frame: truth[frame.id])
     names = segments.classes().names
     assert {"floor", "wall"} <= set(names)

@@ -12,8 +12,17 @@ from msgs_slam.pipelines.evaluation.labels import count_labels, score
 from msgs_slam.pipelines.geometry import voxels
 from msgs_slam.pipelines.geometry.sequence import resample_linear
 from msgs_slam.pipelines.geometry.voxels import FLOOR, OTHER, Gravity, Voxels, merge, voxel_keys
-from msgs_slam.pipelines.labels.named import NamedScene, NetworkClasses, disputed, name_likelihood, one_name_each
-from msgs_slam.pipelines.labels.segments import SegmentLabels
+from msgs_slam.pipelines.labels.named import (
+    NamedScene,
+    NetworkClasses,
+    ShapeLabels,
+    disputed,
+    name_likelihood,
+    one_name_each,
+    recognise,
+)
+from msgs_slam.pipelines.labels.segments import Segments
+from msgs_slam.pipelines.labels.shape import NAMES as SHAPE_NAMES
 from msgs_slam.pipelines.networks.outputs import best_classes
 from msgs_slam.pipelines.providers import DepthEstimate
 from msgs_slam.pipelines.system.progress import SilentProgress
@@ -46,7 +55,7 @@ def depth_of(room: Room, frame: Frame) -> DepthEstimate:
 
 
 def gather(room: Room, said: dict[int, NDArray[np.float32]], vocabulary: NetworkClasses) -> NamedScene:
-    segments = SegmentLabels(room.sequence(), vocabulary.limit, SilentProgress())
+    segments = Segments(room.sequence(), SilentProgress())
     return NamedScene.gather(segments, room.frames, lambda f: depth_of(room, f), lambda f: said[f.id], vocabulary)
 
 
@@ -100,16 +109,16 @@ def test_a_room_of_which_nothing_is_sure_has_the_names_of_each_frame_alone(room:
         return replace(depth, depth=np.where(confidence > 0, depth.depth, 0).astype(np.float32), confidence=confidence)
 
     said = {f.id: coarse(room.views[f.id].labels, np.random.default_rng(1)) for f in room.frames}
-    segments = SegmentLabels(room.sequence(), 16, SilentProgress())
+    segments = Segments(room.sequence(), SilentProgress())
     scene = NamedScene.gather(segments, room.frames, scattered, lambda f: said[f.id], NetworkClasses(NAMES, (0,), 16))
     assert len(scene.keys) == 0
     assert "wall" in scene.names
     found = scene.estimate(room.sequence(), room.frames[0], scattered(room.frames[0]), said[0])
     names = np.array([*scene.names, "void"])[np.minimum(found.labels, len(scene.names))]
     assert (names == np.array(NAMES)[room.views[0].labels]).mean() > 0.5
-    segments.fit(room.frames, scattered)
-    alone = segments.estimate(room.frames[0], scattered(room.frames[0]))
-    assert len(segments.classes()) == 0
+    labels = ShapeLabels(room.sequence(), 16, SilentProgress())
+    labels.fit(room.frames, scattered)
+    alone = labels.estimate(room.frames[0], scattered(room.frames[0]))
     assert (alone.labels == VOID).all()
     assert not alone.confidence.any()
     assert len(segments.heights(room.frames, scattered)) == 0
@@ -135,6 +144,22 @@ def test_floors_lie_and_walls_stand() -> None:
     assert likely[2, 2] == 1
     assert (likely[1:, 3] == 1).all()
     assert (name_likelihood(names, voxels, Gravity(UP.up, False), np.zeros(3, np.int64), 5.0) == 1).all()
+
+
+def test_shape_names_what_a_network_takes_for_a_wall_and_nothing_else() -> None:
+    names = ("wall", "floor", "ceiling", "door", "seating", "table", "storage", "picture")
+    share = np.zeros((3, len(names)), np.float32)
+    share[:, 0], share[:, 7] = [1, 0.5, 0], [0, 0.5, 1]
+    said = np.zeros((3, len(SHAPE_NAMES)), np.float32)
+    said[:, SHAPE_NAMES.index("storage")], said[:, SHAPE_NAMES.index("window")] = 0.8, 0.2
+    recognise(share, names, said)
+    assert np.allclose(share.sum(1), 1)
+    assert share[:, names.index("storage")] == pytest.approx([0.8, 0.4, 0])
+    assert share[:, names.index("picture")] == pytest.approx([0, 0.5, 1])
+    finer = ("wall", "floor", "cabinet")
+    before = np.full((3, 3), 1 / 3, np.float32)
+    recognise(after := before.copy(), finer, said)
+    assert (after == before).all()
 
 
 def test_a_thing_has_one_name_and_its_neighbour_another() -> None:

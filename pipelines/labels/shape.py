@@ -1,0 +1,212 @@
+"""Names from shape: a network that comes with the program reads height, slope and surroundings of all that a keyframe
+shows.
+
+It learned on made rooms, where colour is made up and shape is not: colours only tell it where one thing ends
+(`docs/method.md`).
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from threading import Lock
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from ...formats.tensors import load_arrays
+from ..geometry.camera import resample_nearest, unproject_depth
+from ..geometry.sequence import Sequence, resize_area
+from ..geometry.voxels import CEILING, FLOOR, Gravity, Voxels, find_near, to_lab, voxel_keys
+from ..providers import DepthEstimate
+from ..types import Frame
+
+WEIGHTS = Path(__file__).parent / "shape.npz"
+NAMES = (
+    "wall", "floor", "ceiling", "window", "door", "bed", "seating", "table", "storage", "curtain", "lamp", "picture",
+    "screen", "appliance", "plant", "other",
+)  # fmt: skip
+SIDE = 128
+"""Pixels of the longer side that the network sees."""
+CHANNELS = 17
+_WIDTHS = (16, 32, 48, 64)
+_EYE = 1.45
+"""Metres of a camera over the floor, which stand for the unit: sizes of furniture go by it."""
+_COLUMN = 2
+"""Voxels on a side of the columns in which things stand."""
+_WAYS = 32
+"""Horizontal directions in which is looked for what lies behind a surface."""
+_BEHIND = 0.3
+"""Metres."""
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class RoomShape:
+    """The room by the surface of all keyframes: keys (V,) of voxels of `size`, numbers (V, 7): slope,
+    normal, top and foot of the column it stands in, root of the share of all surface that lies behind it; `up` (3,),
+    heights along it of floor and top, whether floor and ceiling were seen (2,), and the length of a metre."""
+
+    size: float
+    keys: NDArray[np.int64]
+    numbers: Array
+    up: NDArray[np.float64]
+    floor: float
+    top: float
+    seen: tuple[float, float]
+    metre: float
+
+    @classmethod
+    def of(cls, voxels: Voxels, gravity: Gravity, kind: NDArray[np.int64], centres: NDArray[np.float64]) -> RoomShape:
+        """Look at the voxels (V,) with their kinds (V,) of `name_structure`, and the cameras' centres (N, 3)."""
+        height = voxels.position @ gravity.up
+        low, high = np.quantile(height, [0.005, 0.995]) if len(voxels) else (0.0, 0.0)
+        is_floor, is_ceiling = kind == FLOOR, kind == CEILING
+        floor = float(np.median(height[is_floor]) if is_floor.any() else low)
+        top = float(np.median(height[is_ceiling]) if is_ceiling.any() else high)
+        eye = float(np.median(centres @ gravity.up))
+        metre = max(eye - floor, 4 * voxels.size) / _EYE
+        low, high = _columns(voxels, gravity.up, height)
+        behind = np.sqrt(_behind(voxels, gravity.up, _BEHIND * metre))
+        numbers = np.column_stack([voxels.normal @ gravity.up, voxels.normal, high, low, behind]).astype(np.float32)
+        numbers[:, 4:6] = np.clip((numbers[:, 4:6] - [top, floor]) / metre, -3, 3)
+        seen = float(is_floor.any()), float(is_ceiling.any())
+        return cls(voxels.size, voxels.keys, numbers, gravity.up, floor, top, seen, metre)
+
+    def channels(self, sequence: Sequence, frame: Frame, estimate: DepthEstimate) -> Array:
+        """(CHANNELS, h, w) of one keyframe with a pose."""
+        camera = sequence.intrinsics.at_most(SIDE)
+        height, width = camera.height, camera.width
+        depth, sure = (resample_nearest(a, height, width) for a in (estimate.depth, estimate.confidence))
+        world_from_cam = np.linalg.inv(sequence.cam_from_world[frame.id])
+        points = unproject_depth(depth, camera) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+        known = depth > 0
+        at = find_near(self.keys, np.where(known, voxel_keys(points, self.size), -1))
+        numbers = np.vstack([self.numbers, np.zeros((1, 7), np.float32)])[at]  # -1 is the last
+        ways = points - world_from_cam[:3, 3]
+        ways /= np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-12)
+        facing = -(numbers[..., 1:4] * ways).sum(-1)
+        tall = points @ self.up
+        log_depth = np.log(np.maximum(depth / self.metre, 1e-2))
+        edges = np.abs(cv2.Laplacian(np.where(known, log_depth, 0).astype(np.float32), cv2.CV_32F)).clip(max=1)
+        lab = to_lab(resize_area(sequence.image(frame), width, height)) / np.array([50, 30, 30]) - [1, 0, 0]
+        planes = [
+            known, at >= 0, np.where(known, log_depth - 1, 0), sure,
+            np.where(known, np.clip((tall - self.floor) / self.metre, -1, 4) - 1, 0),
+            np.where(known, np.clip((tall - self.top) / self.metre, -4, 1) + 1, 0),
+            numbers[..., 0], facing, numbers[..., 4], numbers[..., 5], numbers[..., 6], edges,
+            np.full(depth.shape, self.seen[0]), np.full(depth.shape, self.seen[1]), *np.moveaxis(lab, -1, 0),
+        ]  # fmt: skip
+        return np.stack(planes).astype(np.float32)
+
+    def probabilities(self, sequence: Sequence, frame: Frame, estimate: DepthEstimate) -> Array:
+        """(h, w, NAMES) over the whole image; 0 where the room has no surface."""
+        planes = torch.from_numpy(self.channels(sequence, frame, estimate))
+        with _ONE_AT_A_TIME, torch.no_grad():
+            found = load_shape_network()(planes[None]).softmax(1)[0]
+        return np.ascontiguousarray(found.permute(1, 2, 0).numpy()) * np.float32(len(self.keys) > 0)
+
+
+def _flat_axes(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(2, 3) two horizontal unit vectors."""
+    first = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(up, first)])
+
+
+def _columns(
+    voxels: Voxels, up: NDArray[np.float64], height: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(V,) least and greatest height of the surface in the upright column around each voxel, and in those beside it."""
+    cell = np.floor(voxels.position @ _flat_axes(up).T / (_COLUMN * voxels.size)).astype(np.int64)
+    cell -= cell.min(0, initial=0)
+    rows, columns = (cell.max(0, initial=0) + 1).tolist()
+    at = cell[:, 0] * columns + cell[:, 1]
+    out = []
+    for sign in (-1.0, 1.0):
+        best = np.full(rows * columns, -np.inf)
+        np.maximum.at(best, at, sign * height)
+        around = cv2.dilate(best.reshape(rows, columns), np.ones((3, 3), np.uint8))
+        out.append(sign * around.ravel()[at])
+    return out[0], out[1]
+
+
+def _behind(voxels: Voxels, up: NDArray[np.float64], away: float) -> NDArray[np.float64]:
+    """(V,) share of all surface that lies at least so far behind each voxel, as its normal has it in the plan; 0 for
+    level ones."""
+    plan, flat = voxels.position @ _flat_axes(up).T, voxels.normal @ _flat_axes(up).T
+    steep = np.linalg.norm(flat, axis=1) > np.sqrt(0.5)
+    way = np.round(np.arctan2(flat[:, 1], flat[:, 0]) / (2 * np.pi) * _WAYS).astype(np.int64) % _WAYS
+    out = np.zeros(len(voxels))
+    for k in range(_WAYS):
+        mine = steep & (way == k)
+        if mine.any():
+            angle = 2 * np.pi * k / _WAYS
+            along = plan @ [np.cos(angle), np.sin(angle)]
+            order = np.argsort(along)
+            summed = np.concatenate([[0.0], np.cumsum(voxels.weight[order])])
+            out[mine] = summed[np.searchsorted(along, along[mine] - away, sorter=order)] / summed[-1]
+    return out
+
+
+class _Block(nn.Module):
+    def __init__(self, before: int, after: int) -> None:
+        super().__init__()
+        self.one = nn.Conv2d(before, after, 3, padding=1, bias=False)
+        self.two = nn.Conv2d(after, after, 3, padding=1, bias=False)
+        self.n1, self.n2 = nn.BatchNorm2d(after), nn.BatchNorm2d(after)
+
+    def fuse(self) -> None:
+        """Take the normalisation into the convolutions, for a network that learns no more."""
+        for conv, norm in (("one", "n1"), ("two", "n2")):
+            setattr(self, conv, fuse_conv_bn_eval(getattr(self, conv), getattr(self, norm)))
+            setattr(self, norm, nn.Identity())
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.n2(self.two(self.n1(self.one(x)).relu_())).relu_()
+
+
+class ShapeNetwork(nn.Module):
+    """A U-Net over the channels of a keyframe."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        w = _WIDTHS
+        self.down = nn.ModuleList(_Block(a, b) for a, b in zip((CHANNELS, *w), w, strict=False))
+        self.up = nn.ModuleList(_Block(b + a, a) for a, b in itertools.pairwise(w))
+        self.out = nn.Conv2d(w[0], len(NAMES), 1)
+
+    def forward(self, planes: Tensor) -> Tensor:
+        """Logits (B, NAMES, h, w) of channels (B, CHANNELS, h, w)."""
+        height, width = planes.shape[2:]
+        x = F.pad(planes, (0, -width % 8, 0, -height % 8), mode="replicate")
+        stack = []
+        for level, down in enumerate(self.down):
+            x = down(x if level == 0 else F.avg_pool2d(x, 2))
+            stack.append(x)
+        stack.pop()
+        for up in reversed(self.up):
+            x = up(torch.cat([F.interpolate(x, scale_factor=2, mode="nearest"), stack.pop()], 1))
+        return self.out(x)[:, :, :height, :width]
+
+
+_ONE_AT_A_TIME = Lock()
+
+
+@cache
+def load_shape_network() -> ShapeNetwork:
+    """Load the network that comes with the program."""
+    network = ShapeNetwork()
+    weights = {k: torch.from_numpy(v.astype(np.float32)) for k, v in load_arrays(WEIGHTS).items()}
+    network.load_state_dict(weights, strict=False)  # how many batches were seen is not kept
+    network.eval()
+    for block in (b for b in network.modules() if isinstance(b, _Block)):
+        block.fuse()
+    return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
