@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from .types import VOID, ClassTable, Frame, require_shape
 
+_FINEST = 0.005
+"""Expected error in log depth at which a depth has all confidence."""
 MAX_CLASSES = 16
 """Segments and clusters make at most this many classes."""
 
@@ -45,6 +47,16 @@ class DepthEstimate:
         normals = None if self.normals is None else np.where(left_out[..., None], np.int8(0), self.normals)
         depth, confidence = (np.where(left_out, np.float32(0), a) for a in (self.depth, self.confidence))
         return DepthEstimate(depth, confidence, self.invalid, normals)
+
+
+def confidence_of(error: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return the confidence of depths by their expected error in log depth: 0.4 at 2 %, 0.3 at 3 %, 0.14 at 10 %."""
+    return np.asarray((_FINEST / np.maximum(error, _FINEST)) ** (2 / 3), np.float32)
+
+
+def error_of(confidence: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return the expected error in log depth by the confidence: what `confidence_of` undoes."""
+    return np.asarray(_FINEST / np.maximum(confidence, 0.01) ** 1.5, np.float32)
 
 
 @dataclass(frozen=True)

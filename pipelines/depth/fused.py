@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..geometry.camera import project, resize_depth
 from ..geometry.sequence import Sequence
-from ..providers import DepthEstimate, DepthProvider
+from ..providers import DepthEstimate, DepthProvider, error_of
 from ..system.parallel import LruCache
 from ..types import Frame
 from .align import SAMPLES_ACROSS, Anchors, FieldModel, fit_fields, kept_views, keyframe_anchors, posed_small
@@ -23,10 +23,8 @@ _OF_NETWORK = FieldModel(Prior(FieldGrid(13, 17), node_sd=0.06, step_sd=0.05), p
 """Each sample counts whole: the error of a network is smooth, and the solver is told how smooth."""
 _BLUR, _STEP = 1 / 150, 1.1
 """Half of the width over which a network blurs a step of depth, as a part of the longer side; how large a step is."""
-_VARIANCE, _GUESS_VARIANCE, _WRONG = 2.5e-5, 0.01, 3e-3
-"""Of the geometry's depth: relative variance (at most the second) and chance of being quite wrong, over confidence
-cubed. By ten made rooms the standard deviation is 0.005 to 0.009 at confidence 0.7, 0.012 at 0.52, 0.019 at 0.4, 0.026
-at 0.33 and 0.06 at 0.17; 0.8, 2.8, 5.0, 8.4 and 18 % are off by more than 5 %."""
+_GUESS = 0.1
+"""The relative error of the geometry's depth counts as this at most."""
 _UNKNOWN_SPREAD = 0.05
 _REACH, _EVIDENCE = 1 / 12, 0.05
 """How far the sure depths tell how good the bent network is, as a part of the longer side, and the share of pixels from
@@ -36,8 +34,8 @@ _CARRIED = 6.0
 keyframe to keyframe, those of a poor one are alike (measured: 0.065 → 0.025, 0.13 → 0.08, 0.15 → 0.11, 0.19 → 0.20)."""
 _AGREE = 3.0
 """Standard deviations beyond which one of the two is taken to be quite wrong."""
-_STRAYS = 40.0
-"""Chance that it is the network, over its variance."""
+_STRAYS = 1.7
+"""It is taken to be the network where that is expected to be off by so many times more."""
 _LEARNED_CONFIDENCE, _TRUSTED_SPREAD = 0.7, 0.05
 _KEPT = 32
 
@@ -90,7 +88,7 @@ class FusedDepth(DepthProvider):
         sure = DepthEstimate(np.where(found.confidence >= SURE, found.depth, np.float32(0)), found.confidence)
         view = posed_small(sure, self._stereo.camera, np.eye(4))
         xy, depth, confidence = view.grid(SAMPLES_ACROSS)
-        return Anchors(xy * (width / view.intrinsics.width), depth, np.sqrt(_VARIANCE / confidence**3))
+        return Anchors(xy * (width / view.intrinsics.width), depth, error_of(confidence))
 
     def _sharpened(self, frame: Frame) -> DepthEstimate:
         """The learned depth in the unit of the backbone, its steps sharpened; of known confidence everywhere."""
@@ -149,10 +147,10 @@ def fuse_with_stereo(bent: NDArray[np.float32], learned: DepthEstimate, geometry
     log_geometry = np.log(np.where(known, geometry.depth, 1))
     off = log_geometry - np.log(np.where(known, bent, 1))
     spread = _spread(off, log_geometry - np.log(np.where(known & (learned.depth > 0), learned.depth, 1)), sure)
-    cube = np.maximum(geometry.confidence, 0.01) ** 3
-    variance = np.minimum(_VARIANCE / cube, _GUESS_VARIANCE)
+    error = error_of(geometry.confidence)
+    variance = np.minimum(error, _GUESS) ** 2
     agree = np.where(known, np.exp(-(off**2) / (2 * _AGREE**2 * (spread**2 + variance))), 0)
-    strays = known & (_STRAYS * spread**2 > _WRONG / cube)
+    strays = known & (spread > _STRAYS * error)
     share = agree * spread**2 / (spread**2 + variance) + (1 - agree) * strays
     depth = np.where(bent > 0, bent * np.exp(share * off), geometry.depth).astype(np.float32)
     trust = np.maximum(_LEARNED_CONFIDENCE * np.exp(-((spread / _TRUSTED_SPREAD) ** 2)), 0.1) * learned.confidence

@@ -37,7 +37,7 @@ _PATCH_SCALE = 3.0
 """Of 1 to 20 that which, with the votes of a network averaged in each patch, named rooms best (two recordings)."""
 
 _GATHER_SIDE = 200
-_MIN_CONFIDENCE = 0.3
+_MIN_CONFIDENCE = 0.2
 _REACH = 40.0
 _COLOR_SD = 40.0
 _MIN_VOTE = 1e-3

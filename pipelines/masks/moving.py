@@ -48,9 +48,9 @@ class Rules:
     in_sight: bool
 
 
-_FIRST, _AGAIN = Rules(0.28, 0.03, True), Rules(0.1, 0.04, False)
-"""Depth that was filled in over a plain surface has at most 0.276: a guess that is wrong in most views accuses a whole
-cupboard. Once something is found in an image, less will do for the rest of it."""
+_FIRST, _AGAIN = Rules(0.42, 0.03, True), Rules(0.24, 0.04, False)
+"""Depth that may be off by more than 2.5 % (the first): a guess that is wrong in most views accuses a whole cupboard.
+Once something is found in an image, less will do for the rest of it (7 %)."""
 _ROUNDS = 3
 _MIN_SHARE = 0.006
 """Of the image: the evidence in a thing; and of the thing itself:"""

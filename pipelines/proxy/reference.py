@@ -38,7 +38,8 @@ _HOW = (
 _MIN_APART = 8.0
 _KEYFRAMES = 5
 _PATCH = 2
-_MIN_CONFIDENCE = 0.3
+_MIN_CONFIDENCE = 0.14
+"""Of depth that is expected to be off by less than 10 %."""
 _PIXEL_SD = 1.0
 """How exactly a person points at a pixel of the proxy maps."""
 

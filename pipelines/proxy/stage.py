@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 
 from ...formats.errors import InputError
-from ..depth.completion.network import expected_error
+from ..depth.completion.fill import SURE
 from ..depth.files import NO_DEPTH
 from ..depth.fused import DepthScale, measure_scale
 from ..depth.stereo.provider import MultiviewDepth
 from ..masks.moving import find_moving
-from ..providers import dump_state
+from ..providers import dump_state, error_of
 from ..run.files import CLASSES, DESCRIPTORS, FIGURES, FRAME_SCALES, LEFT_OUT, PROXY_MAPS
 from ..run.stages import StageContext
 from ..system.progress import log
@@ -27,9 +27,9 @@ from .tasks import (
     precompute_labels,
 )
 
-_MOSTLY_MATCHED = 0.55
-"""Share of reliable pixels below which depth is a guess in large parts: of five recordings two have less (0.40, 0.49;
-depth of the map 6 to 7 % off after one scale), three more (0.63 to 0.82; 0.7 to 2 %)."""
+_MOSTLY_GOOD = 0.45
+"""Share of reliable pixels below which depth is a guess in large parts: of five recordings three have less (0.34 to
+0.44), two more (0.51, 0.85)."""
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -132,10 +132,10 @@ class ProxyStage:
 
     def _warn_of_guesses(self, reliable: float, error: float) -> None:
         """Warn where most of the depth is filled in: an image of the map does not show it."""
-        if self.work.depths.name == MultiviewDepth.name and reliable < _MOSTLY_MATCHED:
+        if self.work.depths.name == MultiviewDepth.name and reliable < _MOSTLY_GOOD:
             self.warn(
-                f"only {reliable:.0%} of the pixels could be matched between views; elsewhere (bare walls, plain "
-                f"floors) depth is filled in from around them and expected to be off by {error:.0%} on average. Film "
+                f"only {reliable:.0%} of the pixels have a depth that is good to 4%; elsewhere (bare walls, plain "
+                f"floors) it is filled in from around them and expected to be off by {error:.0%} on average. Film "
                 "closer and with more texture in view, or let a depth network help: `msgs-slam models pull --best`"
             )
 
@@ -163,7 +163,8 @@ class ProxyStage:
             path, depth = PROXY_MAPS.path(self.context.folder, frame.id), self.work.depth(frame)
             invalid += depth.invalid
             if self.work.depths.name == MultiviewDepth.name:
-                expected = expected_error(depth.confidence)
+                unsure = depth.confidence[(depth.confidence > 0) & (depth.confidence < SURE)]
+                expected = error_of(unsure)
                 error, completed = error + float(expected.sum(dtype=np.float64)), completed + len(expected)
             maps = PROXY_MAPS.read(path)
             sizes.append(path.stat().st_size)

@@ -28,7 +28,6 @@ from .evidence import (
     FEATURES,
     KINDS,
     LEAST_NUMBER,
-    LENT_CONFIDENCE,
     OF_CANDIDATE,
     STEP_OF_NUMBERS,
     Array,
@@ -254,8 +253,6 @@ def load_network(device: str = "cpu") -> CompletionNetwork:
     return network.to(device)
 
 
-_MOST_CONFIDENCE, _FADING = 0.25, 0.05
-"""Of a completed depth, and the expected error in log depth at which a part of 1 / e is left."""
 _SMOOTHED, _LIKE_DEPTH = 1 / 75, 0.06
 """Standard deviation of a bilateral filter as a part of the longer side, and in log depth: what neighbouring pixels
 take from other rows and columns differs by a few per cent."""
@@ -292,22 +289,7 @@ def complete(inputs: CompletionInputs, device: str) -> tuple[Array, Array]:
     return invert(inverse), error
 
 
-def to_confidence(inputs: CompletionInputs, error: Array) -> Array:
-    """Return (h, w) confidence at half the size: of what is not sure by its expected error alone."""
-    sure = np.where(inputs.from_other_views, LENT_CONFIDENCE, inputs.own.confidence)
-    return np.where(inputs.sure, sure, _MOST_CONFIDENCE * np.exp(-error / _FADING)).astype(np.float32)
-
-
-def expected_error(confidence: Array) -> Array:
-    """Return the expected error in log depth of completed pixels (P,) from their confidence, as of `to_confidence`; of
-    sure pixels, which are left out, it says nothing."""
-    completed = confidence[(confidence > 0) & (confidence <= _MOST_CONFIDENCE)]
-    return np.asarray(-_FADING * np.log(completed / _MOST_CONFIDENCE), np.float32)
-
-
 def completed_keyframe(inputs: CompletionInputs, device: str) -> HalfResKeyframe:
     """Return the keyframe as others may ask it: what is not its own is unsure, however good."""
-    depth, error = complete(inputs, device)
-    mine = inputs.own.confidence >= SURE
-    unsure = np.minimum(to_confidence(inputs, error), np.float32(_MOST_CONFIDENCE))
-    return replace(inputs.own, inverse=invert(depth), confidence=np.where(mine, inputs.own.confidence, unsure))
+    own = inputs.own.confidence
+    return replace(inputs.own, inverse=invert(complete(inputs, device)[0]), confidence=own * (own >= SURE))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ....formats.errors import InputError
 from ...geometry.sequence import Sequence, resize_area
 from ...geometry.sparse_model import SparseModel
-from ...providers import DepthEstimate
+from ...providers import DepthEstimate, confidence_of
 from ...system.parallel import LruCache, map_lookahead
 from ...system.progress import Progress
 from ...system.values import load_value, save_value
@@ -26,7 +26,6 @@ from ...types import Frame, Intrinsics
 from ..completion.evidence import (
     ASKED,
     LENDERS,
-    LENT_CONFIDENCE,
     CompletionInputs,
     HalfResKeyframe,
     build_inputs,
@@ -34,7 +33,7 @@ from ..completion.evidence import (
     update_view_evidence,
 )
 from ..completion.fill import SURE, evidence_of, smooth_confidence
-from ..completion.network import HALF, TWICE, complete, completed_keyframe, halved, to_confidence
+from ..completion.network import HALF, TWICE, complete, completed_keyframe, halved
 from .consistency import choose_neighbours, fuse_depths, sweep_range
 from .matching import StereoImages, match_planes
 from .sweep import warps_to
@@ -155,9 +154,10 @@ class MultiviewDepth:
         if inputs is None:
             return depth, np.minimum(confidence, SURE)
         small, error = complete(inputs, self._network_device)
-        found, sure = upsample_depth(small, to_confidence(inputs, error), self._small(index)), confidence >= SURE
-        trust = np.where(sure, confidence, np.minimum(found.confidence, LENT_CONFIDENCE))
-        return np.where(sure, depth, found.depth), trust
+        found = upsample_depth(small, confidence_of(error), self._small(index))
+        # Of a match the network and the views' agreement both say how good it is.
+        sure, trust = confidence >= SURE, found.confidence
+        return np.where(sure, depth, found.depth), np.where(sure, np.sqrt(trust * confidence), trust)
 
     def inputs(self, index: int) -> CompletionInputs | None:
         """Gather what the completion of a keyframe's depth rests on, by its place in the backbone: other keyframes are

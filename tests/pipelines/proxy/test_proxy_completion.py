@@ -26,16 +26,15 @@ from msgs_slam.pipelines.depth.completion.network import (
     Mixture,
     complete,
     completed_keyframe,
-    expected_error,
     halved,
     inputs_of,
     load_network,
     mixture_median,
     numbers_of,
-    to_confidence,
 )
 from msgs_slam.pipelines.depth.stereo.sweep import warps_to
 from msgs_slam.pipelines.depth.stereo.window import surface_contrast
+from msgs_slam.pipelines.providers import confidence_of, error_of
 from tests.benchmarks.rooms.learning import Example, Examples, Fit, example_arrays, loss_of
 
 HEIGHT, WIDTH, FOCAL = 40, 60, 50.0
@@ -179,13 +178,12 @@ def wall_case() -> CompletionInputs:
 def test_a_blank_part_of_a_wall_is_completed_as_a_wall() -> None:
     case, truth = wall_case(), plane_depth(MIDDLE).reshape(HEIGHT // 2, 2, WIDTH // 2, 2).mean((1, 3))
     depth, expected = complete(case, "cpu")
-    confidence, blank = to_confidence(case, expected), ~case.sure
+    blank = ~case.sure
     assert blank.sum() > 100
     error = np.abs(np.log(depth / truth))
     assert error[blank].mean() < 0.3 * np.abs(np.log(case.own.inverse * truth))[blank].mean()
     assert error[blank].max() < 0.1
-    np.testing.assert_array_equal(confidence[blank] < SURE, True)
-    np.testing.assert_allclose(expected_error(confidence), expected[blank], rtol=1e-3, atol=1e-4)
+    assert np.median(expected[blank]) > 1.5 * np.median(expected[~blank])
     np.testing.assert_allclose(
         depth[~blank & ~case.from_other_views], 1 / case.own.inverse[~blank & ~case.from_other_views], rtol=1e-6
     )
@@ -217,10 +215,17 @@ def test_a_keyframe_without_neighbours_is_completed_from_itself() -> None:
     case = build_inputs(own, [], [], [])
     assert case is not None
     depth, expected = complete(case, "cpu")
-    confidence = to_confidence(case, expected)
     assert np.isfinite(depth).all()
     assert depth.min() > 0
-    assert 0 <= confidence.min() <= confidence.max() <= 1
+    assert 0 < expected.min() <= expected.max() <= 1
+
+
+def test_confidence_is_a_view_of_the_expected_error() -> None:
+    error = np.geomspace(0.005, 1, 50)
+    confidence = confidence_of(error)
+    assert (np.diff(confidence) < 0).all()
+    assert confidence_of(np.array([0.0, 0.001])).max() == 1
+    np.testing.assert_allclose(error_of(confidence), error, rtol=1e-4)
 
 
 def test_the_middle_of_a_mixture_has_the_least_expected_error() -> None:

@@ -92,7 +92,7 @@ def test_depth_that_is_mostly_filled_in_is_said_to_be(
     context = make_context("proxy.stereo_side=128")
     figures = run(context)
     share, error = figures["reliable_pixels"], figures["completed_error"]
-    said = [w for w in context.warnings if f"only {share:.0%} of the pixels could be matched" in w]
+    said = [w for w in context.warnings if f"only {share:.0%} of the pixels have a depth that is good to 4%" in w]
     assert bool(said) == is_warned
     assert 0 < error < 1
     assert all(f"off by {error:.0%} on average" in w for w in said)
