@@ -1,7 +1,8 @@
 """The completion network before real cameras: how good it is there, and learning on from recordings with true depth.
 
     python tests/benchmarks/real_depth.py cases DIR RUN=TRUTH ...        runs of `shape.py --recordings`, to DIR/NAME
-    python tests/benchmarks/real_depth.py judge DIR [NAME ...] [--weights NPZ]
+    python tests/benchmarks/real_depth.py hidden DIR RUN ...             cases of what a run itself is sure of, no truth
+    python tests/benchmarks/real_depth.py judge DIR [NAME ...] [--weights NPZ] [--temperature 2]
     python tests/benchmarks/real_depth.py learn DIR NAME ... --made ROOMS --out NPZ [--steps 300]
 
 A case is a keyframe's evidence and true depth, in the unit of the stereo by one scale for each keyframe. `judge` says
@@ -9,7 +10,8 @@ of the pixels without a sure match: mean |log depth ratio| (at most 1), share of
 error where less than 4 % is expected. `learn` starts from the weights that come with the program, with their
 statistics of batches; every third step is of a recording, the others of the rooms of `rooms learn`. With one thread
 the same files give the same bytes. What ships may learn only from recordings whose licence allows it; the others
-judge.
+judge. `hidden` takes balls in space out of all keyframes, as large as what is unsure and where there is least contrast
+among what is sure, and asks for their depth back.
 """
 
 import argparse
@@ -22,6 +24,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
@@ -29,10 +33,13 @@ from shape import true_depths
 
 from msgs_slam.formats.tensors import load_arrays, save_arrays
 from msgs_slam.pipelines.depth.completion import network as completion
+from msgs_slam.pipelines.depth.completion.fill import SURE
 from msgs_slam.pipelines.depth.completion.network import CompletionNetwork, mixture_median
 from msgs_slam.pipelines.depth.stereo.provider import MultiviewDepth
-from msgs_slam.pipelines.geometry.camera import resample_nearest
+from msgs_slam.pipelines.geometry import se3
+from msgs_slam.pipelines.geometry.camera import resample_nearest, unproject, unproject_depth
 from msgs_slam.pipelines.geometry.sequence import Sequence
+from msgs_slam.pipelines.geometry.sparse_model import SparseModel
 from msgs_slam.pipelines.proxy.selection import STEREO_PLANES
 from msgs_slam.pipelines.run.files import BACKBONE, CALIBRATION, FRAMES
 from msgs_slam.pipelines.run.folder import RunFolder
@@ -53,10 +60,15 @@ _MOST, _LEAST_PIXELS = 28, 200
 """Keyframes of a recording, and pixels of one whose truth is known."""
 _BATCH, _RATE, _WARMED = 2, 3e-4, 0.05
 _SURE, _OFF = 0.04, math.log(1.05)
+_CENTRES = 60
+"""Places of a keyframe that a ball may be around; one is drawn."""
+_CHANCE, _CHANCE_PX = 0.15, 12
+"""Of a chance match: sd in log depth, and the pixels over which it is alike."""
 
 
-def leave_cases(run: RunFolder, truth: Path, target: Path) -> None:
-    """Leave a file for each of at most `_MOST` keyframes with truth, as of both rounds of the completion."""
+def leave_cases(run: RunFolder, truth: Path | None, target: Path) -> None:
+    """Leave a file for each of at most `_MOST` keyframes with truth, as of both rounds of the completion; without a
+    file of the truth, it is what was hidden."""
     calibration, config = run.load(CALIBRATION), load_config().proxy
     camera = calibration.intrinsics.at_most(config.max_side)
     sequence = Sequence(run.load(FRAMES), calibration, camera, run.load(BACKBONE), run.image)
@@ -64,14 +76,51 @@ def leave_cases(run: RunFolder, truth: Path, target: Path) -> None:
     matches.mkdir(parents=True, exist_ok=True)
     stereo = MultiviewDepth(sequence, config.stereo_side, STEREO_PLANES, lambda: matches, 1, SilentProgress())
     stereo.precompute(sequence.frames)
-    truths, index = true_depths(run, truth), {int(f): k for k, f in enumerate(run.load(BACKBONE).frame_ids)}
+    index = {int(f): k for k, f in enumerate(run.load(BACKBONE).frame_ids)}
+    truths = hide_balls(stereo, run.load(BACKBONE)) if truth is None else true_depths(run, truth)
     known = [i for i in index if i in truths]
     for i in known[:: -(-len(known) // _MOST)]:
         full = resample_nearest(truths[i].astype(np.float32), stereo.camera.height, stereo.camera.width)
         for round_, inputs in enumerate((stereo.first_inputs(index[i]), stereo.inputs(index[i]))):
             if inputs is not None:
-                arrays = example_arrays(inputs, scaled(inputs, half_truth(full)))
+                small = half_truth(full)
+                arrays = example_arrays(inputs, small if truth is None else scaled(inputs, small))
                 save_arrays(target / f"{i:06d}_{round_}.npz", arrays, compress=False)
+
+
+def hide_balls(stereo: MultiviewDepth, model: SparseModel) -> dict[int, NDArray]:
+    """Make the stereo unsure of all that lies in balls in space, in every keyframe, its depth there a chance match's;
+    return the hidden depths (H, W), 0 elsewhere, by frame id."""
+    rng, camera = np.random.default_rng(0), stereo.camera
+    places, radii, fused = list[NDArray](), list[NDArray](), {}
+    for k in range(len(model.frame_ids)):
+        depth, confidence = fused[k] = stereo._fused(k)
+        sure = (confidence >= SURE) & (depth > 0)
+        if sure.sum() < _LEAST_PIXELS or sure.all():
+            continue
+        # A disk is on average a third of its radius deep.
+        deep = cv2.distanceTransform((~sure).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)[~sure]
+        contrast = stereo._contrast(k)
+        plain = np.flatnonzero(sure & (contrast <= np.median(contrast[sure])))
+        at = rng.choice(plain, _CENTRES)
+        xy, z = np.stack([at % camera.width, at // camera.width], 1) + 0.5, depth.ravel()[at].astype(np.float64)
+        places.append(se3.transform(se3.inverse(model.cam_from_world[k]), unproject(xy, z, camera)))
+        radii.append(3 * rng.choice(deep, _CENTRES) * z / camera.fx)
+    centres, radius = np.concatenate(places), np.concatenate(radii)
+    kept = rng.permutation(len(centres))[: -(-len(centres) // _CENTRES)]
+    tree, reach = cKDTree(centres[kept]), radius[kept]
+    hidden, known = {}, {}
+    for k, (depth, confidence) in fused.items():
+        seen = unproject_depth(depth, camera).reshape(-1, 3)
+        apart, ball = tree.query(se3.transform(se3.inverse(model.cam_from_world[k]), seen), 4)
+        inside = (apart < reach[ball]).any(1).reshape(depth.shape) & (depth > 0)
+        few = rng.normal(size=(camera.height // _CHANCE_PX + 2, camera.width // _CHANCE_PX + 2)).astype(np.float32)
+        chance = depth * np.exp(_CHANCE * cv2.resize(few, depth.shape[::-1], interpolation=cv2.INTER_CUBIC))
+        doubt = rng.choice(confidence[confidence < SURE], depth.shape) if (confidence < SURE).any() else 0 * depth
+        hidden[int(model.frame_ids[k])] = np.where(inside & (confidence >= SURE), depth, np.float32(0))
+        known[k] = np.where(inside, chance, depth), np.where(inside, np.minimum(doubt, confidence), confidence)
+    stereo._fused = known.__getitem__  # type: ignore[assignment]
+    return hidden
 
 
 def load_cases(folder: Path, pattern: str) -> list[Example]:
@@ -144,8 +193,9 @@ def learn(real: list[list[Path]], made: list[list[Path]], steps: int) -> Complet
     return network
 
 
-def table(folder: Path, names: list[str], weights: Path | None) -> None:
+def table(folder: Path, names: list[str], weights: Path | None, temperature: float) -> None:
     """Print a row a recording, by the second round."""
+    completion._TEMPERATURE = temperature
     network, errors = network_of(weights), []
     for name in names or sorted(p.name for p in folder.iterdir() if p.is_dir()):
         error, off, ratio = judge(network, load_cases(folder / name, "*_1.npz"))
@@ -157,10 +207,11 @@ def table(folder: Path, names: list[str], weights: Path | None) -> None:
 def main() -> None:
     """Parse, do."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("cases", "judge", "learn"))
+    parser.add_argument("what", choices=("cases", "hidden", "judge", "learn"))
     parser.add_argument("folder", type=Path, metavar="DIR")
     parser.add_argument("names", nargs="*", metavar="NAME")
     parser.add_argument("--weights", type=Path, metavar="NPZ")
+    parser.add_argument("--temperature", type=float, default=completion._TEMPERATURE)
     parser.add_argument("--made", type=Path, metavar="ROOMS", help="folder of `rooms learn`")
     parser.add_argument("--out", type=Path, metavar="NPZ")
     parser.add_argument("--steps", type=int, default=300)
@@ -170,8 +221,11 @@ def main() -> None:
     if given.what == "cases":
         for run, truth in (pair.split("=") for pair in given.names):
             leave_cases(RunFolder(Path(run)), Path(truth), given.folder / Path(run).stem)
+    elif given.what == "hidden":
+        for run in given.names:
+            leave_cases(RunFolder(Path(run)), None, given.folder / Path(run).stem)
     elif given.what == "judge":
-        table(given.folder, given.names, given.weights)
+        table(given.folder, given.names, given.weights, given.temperature)
     else:
         real = [g for name in given.names for g in by_size(given.folder / name)]
         made = by_size(given.made / "examples", "[0-9]*.npz") if given.made else []

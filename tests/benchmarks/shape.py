@@ -7,9 +7,10 @@
 
 RUN is a run folder with the proxy stage done, TRUTH a data set with depth, or a folder of `shared/data/real`, whose
 depth lies on its pictures. Depths of a run are compared after one scale (the median), every third pixel of the
-keyframes with truth. "off": wrong by more than 5 %. "sure": reliability 0.5 or more. "plain": the third of the pixels
-with least contrast around them; "edges": within four pixels of a step of the true depth; "else": neither. "AUSE":
-area between the share that is off among the surest pixels and the least that any order could have, in per cent.
+keyframes with truth. "off": wrong by more than 5 %. "sure": reliability 0.5 or more; these are off after a scale of
+their own, for where few pixels are sure the others' errors would be theirs. "plain": the third of the pixels with
+least contrast around them; "edges": within four pixels of a step of the true depth; "else": neither. "AUSE": area
+between the share that is off among the surest pixels and the least that any order could have, in per cent.
 """
 
 # ruff: noqa: E402 (the packages are found only once the path is set)
@@ -150,12 +151,13 @@ def measure(p: Pixels) -> dict[str, float]:
     """One row: lengths in centimetres, shares in per cent."""
     error, off = errors(p)
     sure, plain, at_step = p.reliability >= SURE, p.contrast <= np.quantile(p.contrast, 1 / 3), p.at_step > 0
+    among_sure = Pixels(*(values[sure] for values in vars(p).values()))
     row = {
         "L1": 100 * error.mean(),
         "of median %": 100 * error.mean() / np.median(p.truth),
         "off %": 100 * off.mean(),
         "sure %": 100 * sure.mean(),
-        "sure off %": 100 * off[sure].mean() if sure.any() else np.nan,
+        "sure off %": 100 * errors(among_sure)[1].mean() if sure.any() else np.nan,
         "AUSE %": 100 * sparsification(off, p.reliability),
         "plain L1": 100 * error[plain & ~at_step].mean(),
         "edges L1": 100 * error[at_step].mean(),
