@@ -54,9 +54,9 @@ def confidence_of(error: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.asarray((_FINEST / np.maximum(error, _FINEST)) ** (2 / 3), np.float32)
 
 
-def error_of(confidence: NDArray[np.floating]) -> NDArray[np.float32]:
+def error_of(confidence: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the expected error in log depth by the confidence: what `confidence_of` undoes."""
-    return np.asarray(_FINEST / np.maximum(confidence, 0.01) ** 1.5, np.float32)
+    return np.asarray(_FINEST / np.maximum(confidence, 0.01) ** 1.5, np.float64)
 
 
 @dataclass(frozen=True)
