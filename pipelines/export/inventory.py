@@ -48,8 +48,8 @@ _MOST = 2_000_000
 """Faces in which things are looked for, in about 1 GB; a mesh with more is simplified for it."""
 _NUMBERED, _MOST_THINGS = re.compile(r".+ [1-9]\d{0,4}"), 65_535
 """Name of a thing, and the largest number that the files hold."""
-_REACH = 4.0
-"""Usual edges up to which a point belongs to the nearest vertex's thing."""
+_REACH = 10.0
+"""Usual edges up to which a point belongs to the nearest vertex's thing: blurred Gaussians float that far from it."""
 
 
 @dataclass(frozen=True)
