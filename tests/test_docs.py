@@ -3,6 +3,7 @@
 import ast
 import importlib
 import json
+import math
 import os
 import re
 import shlex
@@ -169,9 +170,19 @@ def test_the_bench_of_the_renderer_runs(what: list[str], tmp_path: Path) -> None
 
 def test_pictures_are_there_and_small() -> None:
     names = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", DOCS[0].read_text(encoding="utf-8"))
-    assert names
+    assert names[0].endswith("desk.webp"), "a real recording first"
     for name in names:
-        assert 10_000 < (ROOT / name).stat().st_size < 300_000, name
+        assert 10_000 < (ROOT / name).stat().st_size < (2_000_000 if name.endswith("webp") else 300_000), name
+
+
+def test_pictures_show_the_program_of_today() -> None:
+    """Colours of classes, the page and the report; what is older is to be made anew."""
+    script = of_benchmarks("docs_pictures")
+    shown, today = json.loads((SITE / "pictures" / "shown.json").read_text()), script.today()
+    assert shown.keys() <= script.SHOWN.keys()
+    assert len(shown) >= 3, "images from before there was such a list have no entry until they are made anew"
+    older = {name: [part for part in script.SHOWN[name] if shown[name].get(part) != today[part]] for name in shown}
+    assert not any(older.values()), f"older than what they show: {older}: `docs_pictures.py ... --only` makes them anew"
 
 
 @pytest.mark.parametrize("line", sorted(set(re.findall(r"^msgs-slam [a-z].*$", texts(), flags=re.MULTILINE))))
@@ -267,6 +278,17 @@ def test_a_whole_set_that_was_run_has_its_means_on_the_page() -> None:
     text = public.page(kept)
     assert "| parts only, below | parts only, below | 4.50 / 5.5 | – / – / 1.25 |" in text
     assert "| office0 | whole | 9 of 10 | 1.00 | 2.0 | 0.90 ± 10% | 0.5 | 60 |" in text
+
+
+def test_a_sequence_is_measured_from_its_images_alone(world_sequence: Path, tmp_path: Path) -> None:
+    """Metres are those that the run itself estimates: exact ones for the shape, and an honest deviation."""
+    small = ("frames.max_features=500", "proxy.stereo_side=64")
+    row = of_benchmarks("public").measure_sequence(world_sequence, tmp_path / "world.msgs", small)
+    assert row["posed"] == row["frames"] == 32
+    assert 0 < row["sim3_cm"] < 3
+    assert row["sim3_cm"] < row["se3_cm"] < 100
+    assert row["deviations"] == pytest.approx(abs(math.log(row["scale"])) / row["sd"])
+    assert row["deviations"] < 3
 
 
 def test_the_man_page_is_that_of_todays_commands() -> None:

@@ -1,17 +1,23 @@
-"""The pictures of the documentation, made anew from a finished run of the demo.
+"""The pictures of README and site, made anew from finished runs: of the demo, and of a real recording.
 
-python tests/benchmarks/docs_pictures.py msgs-demo/room.msgs docs/pictures [--only wide demo_views ...] [--takes DIR]
+    python tests/benchmarks/docs_pictures.py msgs-demo/room.msgs docs/pictures --desk desk.msgs
+    python tests/benchmarks/docs_pictures.py msgs-demo/room.msgs docs/pictures --only page report
 
-Screenshots (report, viewer, page) need Chromium. --takes keeps the two videos of the page on filming that are refused.
+desk.msgs: `msgs-slam reconstruct` of a video, 10 images a second, of every third image of TUM RGB-D's freiburg1_xyz
+from number 400 on, 68 in all (CC BY 4.0; README names its authors). Screenshots (report, viewer, page) need Chromium.
+--takes DIR keeps the two videos of the page on filming that are refused. `shown.json` beside the pictures says which
+colours, page and report they show; a test compares it with those of today.
 """
 
 import argparse
+import hashlib
+import json
 import shutil
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -19,15 +25,22 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as Film
 
+from msgs_slam.formats.glb import read_mesh_glb
 from msgs_slam.formats.video import VideoReader
 from msgs_slam.formats.video_streams import write_video
+from msgs_slam.pipelines.evaluation.film import render_run
+from msgs_slam.pipelines.evaluation.html import STYLE
 from msgs_slam.pipelines.evaluation.report import write_report
+from msgs_slam.pipelines.evaluation.views import label_picture, mesh_picture, render_outcome
 from msgs_slam.pipelines.evaluation.write import CLIP, VIDEO
 from msgs_slam.pipelines.export.stage import export_run
+from msgs_slam.pipelines.export.web_page import PARTS
+from msgs_slam.pipelines.providers import class_colors
 from msgs_slam.pipelines.run.folder import RunFolder
-from msgs_slam.pipelines.run.outcome import load_outcome
-from tests.benchmarks.first_picture import first_picture
+from msgs_slam.pipelines.run.outcome import Outcome, load_outcome
+from msgs_slam.pipelines.scene.world import WORLD
 from tests.browser import Page, browser
 from tests.world import ClipOptions, World, iter_clip, make_world, render_view
 from tests.world.clip import develop
@@ -38,9 +51,40 @@ TEXEL = 0.006
 TURNED, HURRIED = ClipOptions(frames=30), ClipOptions(frames=18, laps=1.0, shutter=1.0, noise=14.0)
 
 
-def wide(run: RunFolder, target: Path, _: Path) -> None:
-    """Frame, map, classes, mesh."""
-    cv2.imwrite(str(target / "wide.jpg"), first_picture(load_outcome(run)), QUALITY)
+def desk(run: RunFolder, target: Path, scratch: Path) -> None:
+    """A film of the map as `render --path orbit` makes it; right of it a frame, and classes and mesh from there."""
+    outcome = load_outcome(run)
+    row = len(outcome.frames) // 2
+    panels = {"video": outcome.run.image(outcome.frames[row]), **drawn(outcome, row)}
+    beside = np.concatenate([titled(name, picture) for name, picture in panels.items()], axis=0)
+    render_run(run, scratch / "orbit", path="orbit", fps=5.0, size=(SIDE * 4 // 3, SIDE), tell=lambda _: None)
+    images = [cv2.imread(str(p))[..., ::-1] for p in sorted((scratch / "orbit").glob("*.png"))]
+    shown = [Film.fromarray(np.concatenate([i, beside[: i.shape[0]]], axis=1)) for i in images]
+    shown[0].save(
+        target / "desk.webp", save_all=True, append_images=shown[1:], duration=120, loop=0, quality=70, method=6
+    )
+
+
+def drawn(outcome: Outcome, row: int) -> dict[str, Image]:
+    """Classes and mesh as the camera of that frame sees them."""
+    view = render_outcome(outcome, outcome.trajectory.cam_from_world[row])
+    world = WORLD.read(outcome.run.file("export", "world.json"))
+    mesh = read_mesh_glb(outcome.run.file("export", "mesh.glb"))
+    mesh = replace(mesh, vertices=(mesh.vertices @ world.gltf_from_exported).astype(np.float32))
+    moved = outcome.moved(world.exported_from_run).trajectory.cam_from_world[row]
+    return {
+        "labels": label_picture(view.labels, outcome.classes.colors),
+        "textured mesh": mesh_picture(mesh, moved, outcome.calibration.intrinsics),
+    }
+
+
+def titled(name: str, picture: Image) -> Image:
+    """A third of the film's height, with its name in the corner and a gap above and left."""
+    size = (SIDE * 4 // 9 - GAP, SIDE // 3 - GAP)
+    resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    for thickness, shade in ((3, (0, 0, 0)), (1, (255, 255, 255))):
+        cv2.putText(resized, name, (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, shade, thickness, cv2.LINE_AA)
+    return np.pad(resized, ((GAP // 2, GAP // 2), (GAP, 0), (0, 0)), constant_values=255)
 
 
 def demo_views(run: RunFolder, target: Path, _: Path) -> None:
@@ -133,9 +177,23 @@ def at_width(image: Image, width: int) -> Image:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
+def today() -> dict[str, str]:
+    """What pictures show of the program: digests of the classes' colours, the page's marks and the report's."""
+    names = ("wall", "floor", "ceiling", "table", "chair", "bed", "door", "object 1", "object 2", "object 3")
+    page = "".join((PARTS / name).read_text(encoding="utf-8") for name in ("page.html", "style.css"))
+    texts = {"colours": str(class_colors(names)), "page": page, "report": STYLE}
+    return {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in texts.items()}
+
+
+SHOWN = {
+    "desk.webp": ["colours"], "demo_views.jpg": ["colours"], "viewer.jpg": ["colours", "page"], "page.jpg": ["page"],
+    "report.jpg": ["colours", "report"],
+}  # fmt: skip
+"""What of `today` is to be seen in a picture."""
+SIDE, GAP = 405, 4
 QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 86]
 MAKERS: dict[str, Callable[[RunFolder, Path, Path], None]] = {
-    f.__name__: f for f in (wide, demo_views, takes, report, viewer, page)
+    f.__name__: f for f in (desk, demo_views, takes, report, viewer, page)
 }
 
 
@@ -144,14 +202,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("target", type=Path)
+    parser.add_argument("--desk", type=Path, help="the finished run of the real recording")
     parser.add_argument("--only", nargs="*", choices=MAKERS, default=list(MAKERS))
     parser.add_argument("--takes", type=Path)
     given = parser.parse_args()
+    kept = given.target / "shown.json"
     for name in given.only:
+        run = given.desk if name == "desk" else given.run
+        if run is None:
+            parser.error("desk.webp needs --desk, or leave it out by --only")
         with tempfile.TemporaryDirectory() as scratch:
-            keep = given.takes if name == "takes" and given.takes else Path(scratch)
-            partial(MAKERS[name], RunFolder(given.run), given.target)(keep)
-            print(name)
+            MAKERS[name](
+                RunFolder(run), given.target, given.takes if name == "takes" and given.takes else Path(scratch)
+            )
+        known = json.loads(kept.read_text()) if kept.exists() else {}
+        new = {picture: {k: today()[k] for k in SHOWN[picture]} for picture in SHOWN if picture.startswith(f"{name}.")}
+        kept.write_text(json.dumps(dict(sorted((known | new).items())), indent=1) + "\n")
+        print(name)
 
 
 if __name__ == "__main__":

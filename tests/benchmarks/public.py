@@ -21,7 +21,7 @@ import json
 import math
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import date
 from itertools import chain
 from pathlib import Path
@@ -154,12 +154,8 @@ figures of the others are from the [tables of DASH-SLAM's repository](https://gi
 
 {sets}
 
-`python tests/benchmarks/public.py --sets DIR` runs whole sets, where they have been downloaded. Run here, so far:
-
-{parts}
-
-Each from its images alone until all are posed, with the three small networks ({sets_date}). Metres: estimated over true
-metres per unit; then by how many of its own standard deviations the estimate is off.
+`python tests/benchmarks/public.py --sets DIR` runs whole sets, where they have been downloaded, and `--parts` the parts
+that we have. {parts}
 
 ## Beside COLMAP
 
@@ -171,6 +167,10 @@ poses, with its own features, it does not, and the rows below say what it reache
 report of **whole** sequences, live and with a GPU: another task on other images. They say where this program
 stands, not which one is better. DROID-SLAM with an unknown camera gets its focal length from a network.
 """
+
+_RUN_HERE = """\
+Each from its images alone until all are posed, with the three small networks. Metres: estimated over true metres per
+unit; then by how many of its own standard deviations the estimate is off."""
 
 
 def page(kept: dict[str, Any]) -> str:
@@ -200,6 +200,8 @@ def _sets(sequences: dict[str, Any]) -> str:
 
 def _sequences(sequences: dict[str, Any]) -> str:
     """What was run here, sequence by sequence."""
+    if not sequences:
+        return "Of no sequence the metres have been measured so yet; paths of three parts are below."
     rows = [
         (
             name.removeprefix("rgbd_dataset_"), row["part"] or "whole", f"{row['posed']} of {row['frames']}",
@@ -209,7 +211,7 @@ def _sequences(sequences: dict[str, Any]) -> str:
         for name, row in sorted(sequences.items())
     ]  # fmt: skip
     header = ("sequence", "images", "posed", "Sim(3), cm", "SE(3), cm", "metres", "deviations", "CPU s")
-    return "\n".join(markdown_table(header, rows))
+    return "\n".join([_RUN_HERE, "", *markdown_table(header, rows)])
 
 
 def _measured(row: dict[str, Any]) -> Iterator[tuple[str, ...]]:
@@ -239,7 +241,7 @@ def measured() -> dict[str, Any]:
     return rows
 
 
-def measure_sequence(folder: Path, run_folder: Path) -> dict[str, Any]:
+def measure_sequence(folder: Path, run_folder: Path, settings: Sequence[str] = ()) -> dict[str, Any]:
     """From the images alone until every one is posed: errors in centimetres, estimated over true metres per unit with
     its stated relative deviation, and CPU seconds."""
     from tracking import PLAIN, errors, original_names, run_stages_timed
@@ -259,13 +261,14 @@ def measure_sequence(folder: Path, run_folder: Path) -> dict[str, Any]:
         if not (images / path.name).exists():
             (images / path.name).symlink_to(path.resolve())
     run = RunFolder(run_folder)
-    _, seconds = run_stages_timed(images, run, load_config(overrides=[*PLAIN, "run.threads=1"]), "tracking")
+    _, seconds = run_stages_timed(images, run, load_config(overrides=[*PLAIN, "run.threads=1", *settings]), "tracking")
     frames, trajectory = run.load(FRAMES), run.load(TRAJECTORY, "tracking")
     assert sequence.world_from_cam is not None
     true = dict(zip((p.name for p in sequence.image_paths), sequence.world_from_cam, strict=True))
     truth = [p if np.isfinite(p := true[name]).all() else None for name in original_names(images, frames)]
     row = errors(trajectory.cam_from_world, trajectory.is_posed, truth, False)
     metres, _ = find_metres(run, trajectory, True, metric_card())
+    assert metres is not None
     known = [k for k, pose in enumerate(truth) if pose is not None and trajectory.is_posed[k]]
     ours, wanted = trajectory.centers[known], np.array([truth[k][:3, 3] for k in known])
     scale = metres.per_unit / align_points(ours, wanted).scale
@@ -286,7 +289,6 @@ def run_sequences(folders: dict[str, tuple[Path, str]], work: Path, kept: dict[s
         print(name, row, flush=True)
         if "failed" not in row:
             kept["sequences"][name] = {"part": part, **{k: _short(v) for k, v in row.items()}}
-            kept["sets_date"] = f"{date.today():%B %Y}"
             KEPT.write_text(json.dumps(kept, indent=1) + "\n")
 
 
