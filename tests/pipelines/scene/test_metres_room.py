@@ -165,7 +165,10 @@ def test_an_export_with_a_guess_differs_in_words_only(run: RunFolder, tmp_path: 
     guessed, free = tmp_path / "auto", tmp_path / "free"
     names = {str(p.relative_to(free)) for p in free.rglob("*") if p.is_file()}
     differ = {n for n in names if (free / n).read_bytes() != (guessed / n).read_bytes()}
-    assert differ == {"README.txt", "trajectory.txt", "scale.json", "map.html"}
+    assert differ == {"README.txt", "trajectory.txt", "scale.json", "map.html", "things.json"}
+    metres = {name: None for name in ("metres", "metres_sd")}
+    without = [[row | metres for row in read_json(f / "things.json")] for f in (guessed, free)]
+    assert without[0] == without[1]
     rows = [[r for r in (f / "trajectory.txt").read_text().splitlines() if r[0] != "#"] for f in (guessed, free)]
     assert rows[0] == rows[1]
     for text in ((guessed / "trajectory.txt").read_text(), (guessed / "README.txt").read_text()):
