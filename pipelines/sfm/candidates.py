@@ -54,6 +54,9 @@ _TRACKS, _TRACKS_IN_A_CHAIN = 150, 300
 """Tracks, the longest, by which the global mapper places each view; the last adjustment has all of them again. Of nine
 recordings 150 give poses as good as 300 in two thirds of the time. Where only neighbours share any they do not: a
 corridor that is 0.3 cm off with 300 is 3 m off with 150, too far for its loops to close."""
+_STRETCH, _STARTS = 40, (0.6, 0.7, 0.8, 0.95, 1.15, 1.4)
+"""Keyframes in a row, and focal lengths in longer sides from which they are mapped: where a camera turns on the spot,
+one that is a fifteenth too long makes a flat model that no adjustment opens, one as much too short is mended."""
 _ScoredModel = tuple[pycolmap.Reconstruction, str, ModelReport]
 """A model, the mapper that made it, and how good it is."""
 
@@ -92,6 +95,12 @@ class AdjustedModel:
     readout: Readout
 
 
+def pairs_within(pairs: Sequence[VerifiedPair], part: range) -> list[VerifiedPair]:
+    """Select the pairs of keyframes of a part, renumbered from 0."""
+    inside = (p for p in pairs if p.first in part and p.second in part)
+    return [replace(p, first=p.first - part.start, second=p.second - part.start) for p in inside]
+
+
 def _better(
     first: AdjustedModel | None, second: AdjustedModel | None, views: KeyframeSet, pairs: Sequence[VerifiedPair]
 ) -> AdjustedModel | None:
@@ -105,9 +114,8 @@ def _better(
 @dataclass(frozen=True, kw_only=True)
 class CandidateModels:
     """Inputs of candidate models besides the keyframes: `camera` is the prior, `is_fixed` holds it, `is_stated` holds
-    it unless the images contradict it; `asks_pairs`: the focal length that pairs tell, not COLMAP's guess, is where
-    calibration starts. `frame_interval`: seconds from one image of the source to the next, 0 where its times
-    are unknown; no readout is longer. cam_from_rig (C, 3, 3): keyframes are ordered direction by direction, as in
+    it unless the images contradict it. `frame_interval`: seconds from one image of the source to the next, 0 where its
+    times are unknown; no readout is longer. cam_from_rig (C, 3, 3): keyframes are ordered direction by direction, as in
     `Rig`."""
 
     config: FramesConfig
@@ -117,7 +125,6 @@ class CandidateModels:
     progress: Progress
     seed: int
     is_stated: bool = False
-    asks_pairs: bool = True
     frame_interval: float = 0.0
     cam_from_rig: NDArray[np.float64] = field(default_factory=lambda: ONE_CAMERA.cam_from_rig)
 
@@ -142,14 +149,38 @@ class CandidateModels:
         return replace(self, camera=camera, is_fixed=False, is_stated=False, snapshots=snapshots)._best(views, pairs)
 
     def _best(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> AdjustedModel | None:
-        """Return the best adjusted model, of two starting focal lengths where one leaves it unsure."""
+        """Return the best adjusted model; where the focal length that pairs tell leaves it unsure, also from one that a
+        stretch of the path tells."""
         found = self._adjusted(views, pairs)
         if found is None or found.focal_sd < _UNSURE * found.model.cameras[1].mean_focal_length():
             return found
         if self.camera.has_prior_focal_length:
             return found
-        other = replace(self, asks_pairs=False, snapshots=self.snapshots.inside("from_guess"))._adjusted(views, pairs)
+        camera = self._by_stretch(views, pairs)
+        if camera is None:
+            return found
+        other = replace(self, camera=camera, snapshots=self.snapshots.inside("from_stretch"))._adjusted(views, pairs)
         return _better(found, other, views, pairs)
+
+    def _by_stretch(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> pycolmap.Camera | None:
+        """The camera that explains the matches of the best connected keyframes in a row best, None where none does."""
+        steps, count = {p.first: len(p.matches) for p in pairs if p.second == p.first + 1}, len(views.xy)
+        rows = [range(k, min(k + _STRETCH, count)) for k in range(0, max(count - _STRETCH, 0) + 1, _STRETCH // 4)]
+        stretch = max(rows, key=lambda row: min((steps.get(k, 0) for k in row[:-1]), default=0))
+        part, inside, tried = views.part(stretch), pairs_within(pairs, stretch), list[pycolmap.Reconstruction]()
+        width, height = self.camera.width, self.camera.height
+        for number, share in enumerate(_STARTS):
+            camera = unknown_camera(width, height, share * max(width, height), is_prior=True)
+            snapshots = self.snapshots.inside(f"focal_{number}")
+            held = replace(self, camera=camera, is_fixed=True, snapshots=snapshots)
+            found = held._build_model("global", part, inside, inside)
+            if found is not None and found[2].registered >= _MIN_KEYFRAMES and found[2].points >= _MIN_POINTS:
+                adjust_model(found[0], refine_camera=True)
+                tried.append(found[0])
+        if not tried:
+            return None
+        best = min(tried, key=lambda m: unexplained(m, inside, part.xy) / m.num_reg_images())
+        return unknown_camera(width, height, best.cameras[1].mean_focal_length(), is_prior=True)
 
     def _adjusted(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> AdjustedModel | None:
         """Return the best adjusted model, with the readout of a rolling shutter that is given or found."""
@@ -261,7 +292,7 @@ class CandidateModels:
         features, database = views.features, work / "database.db"
         names = [f"{i:06d}" for i in range(len(features))]
         camera = self.camera
-        if start is None and self.asks_pairs:
+        if start is None:
             camera, pairs = calibrated(camera, pairs, views.xy)
         write_database(database, camera, names, features, pairs, self.cam_from_rig)
         features.forget()  # the mapper needs the memory, and no descriptor

@@ -18,7 +18,7 @@ from ..system.parallel import LruSequence, parallel_map
 from ..system.progress import log
 from ..types import Features, Vocabulary
 from .adjust import adjust_model
-from .candidates import GIVEN_ONLY, AdjustedModel, CandidateModels, KeyframeSet
+from .candidates import GIVEN_ONLY, AdjustedModel, CandidateModels, KeyframeSet, pairs_within
 from .components import cut, remove_keyframes, undetermined_cameras
 from .consistency import MAX_DRIFT, NO_DRIFT, ModelReport, judge, scale_drift
 from .features import (
@@ -202,10 +202,8 @@ class StructureFromMotion(CandidateModels):
         figures = snapshots.folder / "adjusted.json"
 
         def solve(_: Path) -> pycolmap.Reconstruction | None:
-            inside = [replace(p, first=p.first - window.start, second=p.second - window.start)
-                      for p in pairs if p.first in window and p.second in window]  # fmt: skip
             of_window = replace(self, is_stated=False, snapshots=snapshots)
-            if (found := of_window._calibrated(views.part(window), inside)) is None:
+            if (found := of_window._calibrated(views.part(window), pairs_within(pairs, window))) is None:
                 return None
             write_json(figures, [found.mapper, found.focal_sd, found.score, found.readout])
             return found.model
