@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..config import MappingConfig
 from ..geometry.posed_depth import overlaps
-from ..render.api import Rendering, class_weights, in_view, marked_in_view, project_map, render
+from ..render.api import Rendering, blending_weights, class_weights, in_view, marked_in_view, project_map, render
 from ..render.gaussian_map import GaussianMap
 from ..render.rules import GaussianStats
 from ..system import gpu
@@ -35,6 +35,8 @@ SNAPSHOT_EVERY = 150
 _MIN_VOTES = 1e-6
 """Pixels: who has less of all views keeps the classes that he has."""
 
+_HARDLY_SEEN = 0.3
+"""Pixels below which a Gaussian hardly counts when the colours are solved."""
 MAP_RATES = {"means": 0.1, "log_radii": 3e-2, "opacity_logits": 8e-2, "colors": 2.5e-2}
 """Learning rates of Adam, of positions in radii of the Gaussian: what is small has to be placed finely."""
 HALVES_ROOM = 250e6
@@ -100,6 +102,7 @@ def optimise_map(
             state.save(snapshot)
     if schedule.grows:
         optimiser.growth.prune(by_weight=False)
+    optimiser.solve_colors()
     if classes > 0:
         optimiser.count_labels()
     return state.result(views, schedule.total)
@@ -306,6 +309,36 @@ class MapOptimiser:
         from .cuda_losses import card_loss  # imports triton
 
         return card_loss(self.objective, view, exposure, rendering, log_radii, in_view)
+
+    def solve_colors(self) -> None:
+        """Move the colours towards those that all views together want, all else given: the first step of conjugate
+        gradients (Hestenes and Stiefel 1952) of linear least squares, scaled by the pixels that each fills."""
+        colors, gaussian_map = self.state.parameters["colors"].detach(), self.state.parameters.to_map()
+        if len(colors) == 0:
+            return
+        filled = torch.full_like(colors[:, :1], _HARDLY_SEEN)
+        for index, view in enumerate(self.views):
+            filled[:, 0] += blending_weights(gaussian_map, self.state.cam_from_world(index, view), view.intrinsics)[0]
+        left = self._pulled_back(colors, True)
+        way = left / filled
+        share = (left * way).sum() / (way * self._pulled_back(way, False)).sum().clamp(min=1e-30)
+        with torch.no_grad():
+            self.state.parameters["colors"].add_(share * way)
+
+    def _pulled_back(self, colors: Tensor, is_compared: bool) -> Tensor:
+        """(M, 3) each Gaussian's sum, over its pixels of all views and by its weight there, of what `colors` (M, 3)
+        show, or of the photographs less that."""
+        total, fixed = torch.zeros_like(colors), {k: self.state.parameters[k].detach() for k in KEYS}
+        for index, view in enumerate(self.views):
+            pose = self.state.cam_from_world(index, view)
+            rows = in_view(fixed["means"], torch.exp(fixed["log_radii"]), pose, view.intrinsics)
+            values = {k: v.index_select(0, rows) for k, v in {**fixed, "colors": colors}.items()}
+            gain, offset = torch.exp(self.state.exposures[index, 0]), self.state.exposures[index, 1]
+            drawn = self.draw(view, pose, {**values, "colors": values["colors"].requires_grad_()})
+            shown = drawn.features[..., :3] * gain
+            wanted = view.colors - offset - shown.detach() if is_compared else shown.detach()
+            total.index_add_(0, rows, torch.autograd.grad(shown, values["colors"], view.of_scene(wanted))[0])
+        return total
 
     @torch.no_grad()
     def count_labels(self) -> None:

@@ -60,6 +60,17 @@ def test_a_view_that_is_all_masked_is_not_judged(room: MappingInput, mapped: Opt
     assert 10 < some.psnr < 60
 
 
+def test_colours_are_solved_once_all_else_is_done(room: MappingInput, mapped: OptimisedMap) -> None:
+    """Without a visit only they change: towards the photographs from wherever they were."""
+    noise = 0.1 * torch.randn(mapped.gaussian_map.colors.shape, generator=torch.Generator().manual_seed(0))
+    wrong = replace(mapped.gaussian_map, colors=mapped.gaussian_map.colors + noise)
+    exposure = mapped.log_gains, mapped.offsets
+    solved = optimise_map(room.views, len(room.class_ids), SETTINGS, 0, wrong, passes=0, exposure=exposure)
+    assert torch.equal(solved.gaussian_map.means, wrong.means)
+    before, after = (mean(replace(mapped, gaussian_map=m), room.views, "psnr") for m in (wrong, solved.gaussian_map))
+    assert before + 1 < after < before + 20
+
+
 def test_the_map_shows_what_the_frames_show(room: MappingInput, mapped: OptimisedMap) -> None:
     assert 27 < mean(mapped, room.views, "psnr") < 45
     assert 24 < mean(mapped, room.held_out, "psnr") < mean(mapped, room.views, "psnr")
