@@ -29,16 +29,17 @@ _ROUNDS = 20
 _FAR_OFF = 5.0
 """Standard deviations from which a given pose is wrong altogether."""
 _MIN_SD = 1e-6
-_APART_DEGREES, _APART_SHARE = 3.0, 0.4
+_APART_DEGREES, _APART_SHARE, _TURNED_SHARE = 3.0, 0.4, 0.2
 """Scatter of all given poses, in degrees and as a share of their path's extent, beyond which they are not those of the
-images. Of phones and of SLAM it is below 2 degrees; positions of other frames scatter by 0.6."""
+images. Of phones and of SLAM it is below 2 degrees; positions of other frames scatter by 0.6. Those of a camera that
+hardly does more than turn scatter too: directions that agree to less than a fifth of how they turn are its own."""
 
 
 @dataclass(frozen=True)
 class GivenFit:
     """Fit of given poses to found ones: given = `move`(found); standard deviations of the inliers, in the given unit
-    and in degrees; `wrong` (N,): outliers; `scale_sd`: relative; `extent`: root mean square distance of the given
-    positions from their middle."""
+    and in degrees; `wrong` (N,): outliers; `scale_sd`: relative; `extent` and `extent_degrees`: root mean square
+    distance of the given positions, and angle of the directions, from their middle."""
 
     move: Similarity
     position_sd: float
@@ -46,11 +47,13 @@ class GivenFit:
     wrong: NDArray[np.bool_]
     scale_sd: float
     extent: float
+    extent_degrees: float
 
     @property
     def is_contradiction(self) -> bool:
         """Return whether the two have so little in common that they cannot be poses of the same images."""
-        return self.degrees_sd > _APART_DEGREES or self.position_sd > _APART_SHARE * self.extent
+        turns_agree = self.degrees_sd < _TURNED_SHARE * self.extent_degrees
+        return self.degrees_sd > _APART_DEGREES or (self.position_sd > _APART_SHARE * self.extent and not turns_agree)
 
 
 def fit_given_poses(found: Array, given: Array) -> GivenFit | None:
@@ -79,7 +82,10 @@ def fit_given_poses(found: Array, given: Array) -> GivenFit | None:
     wrong = (away > _FAR_OFF * sds[0] + _MIN_SD) | (turned > _FAR_OFF * sds[1] + _MIN_SD)
     move = Similarity(scale, rotation, mean_b - scale * rotation @ mean_a)
     relative_sd = sds[0] / max(scale * np.sqrt(spread), 1e-12)
-    return GivenFit(move, sds[0], sds[1], wrong, relative_sd, scale * float(np.sqrt(spread / weight.sum())))
+    middle = np.average(theirs[:, :3, :3], axis=0, weights=weight)  # |R - middle|² is twice the squared angle
+    turned_extent = math.degrees(math.sqrt(max(3 - float((middle**2).sum()), 0) / 2))
+    extent = scale * float(np.sqrt(spread / weight.sum()))
+    return GivenFit(move, sds[0], sds[1], wrong, relative_sd, extent, turned_extent)
 
 
 def _turns(ours: Array, theirs: Array, rotation: Array) -> Array:

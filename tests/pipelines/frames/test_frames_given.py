@@ -86,6 +86,23 @@ def test_only_poses_that_contradict_all_of_a_sound_structure_are_refused(tmp_pat
         judge(other, range(20))
 
 
+def test_a_camera_that_turns_where_it_stands_is_known_by_its_turns() -> None:
+    rng, count = np.random.default_rng(3), 40
+    turns = np.column_stack([np.zeros((count, 4)), np.linspace(-0.6, 0.6, count), np.zeros(count)])
+    world_from_cam = se3.exp(turns)
+    world_from_cam[:, :3, 3] = rng.normal(0, 0.04, (count, 3))
+    noisy = world_from_cam @ se3.exp(np.column_stack([np.zeros((count, 3)), rng.normal(0, 0.01, (count, 3))]))
+    noisy[:, :3, 3] += rng.normal(0, 0.05, (count, 3))
+    own = fit_given_poses(se3.inverse(world_from_cam), se3.inverse(noisy))
+    slower = fit_given_poses(se3.inverse(world_from_cam)[::2], se3.inverse(noisy)[: count // 2])
+    assert own is not None
+    assert own.extent_degrees == pytest.approx(np.degrees(1.2 / np.sqrt(12)), rel=0.1)
+    assert own.position_sd > 0.4 * own.extent
+    assert not own.is_contradiction
+    assert slower is not None
+    assert slower.is_contradiction
+
+
 @pytest.mark.parametrize("is_known", [True, False], ids=["known_camera", "unknown_camera"])
 def test_poses_that_are_far_off_make_a_model_as_good_as_none(is_known: bool, tmp_path: Path) -> None:
     made = walk_round(CAMERA)
