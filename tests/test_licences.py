@@ -81,14 +81,16 @@ def test_a_plain_install_brings_permissive_licences() -> None:
 
 def test_the_documentation_names_the_weights_and_the_gpl_that_come_along() -> None:
     places = ("formats", "pipelines", "msgs_cli")
-    weights = [p for room in places for p in (ROOT / room).rglob("*") if p.suffix in WEIGHTS and p.is_file()]
-    assert [p.relative_to(ROOT).as_posix() for p in weights] == ["pipelines/depth/completion/weights.npz"]
+    weights = sorted(p for room in places for p in (ROOT / room).rglob("*") if p.suffix in WEIGHTS and p.is_file())
+    of_ours = ["pipelines/depth/completion/weights.npz", "pipelines/labels/shape.npz"]
+    assert [p.relative_to(ROOT).as_posix() for p in weights] == of_ours
+    sizes = " and ".join(f"{p.stat().st_size / 1e6:.1f}" for p in weights)
     installed = importlib.metadata.files(PROJECT["name"]) or []  # those of the wheel, where it is what is tested
-    assert {p.name for p in installed if p.suffix in WEIGHTS and len(p.parts) > 1} <= {weights[0].name}
+    assert {p.name for p in installed if p.suffix in WEIGHTS and len(p.parts) > 1} <= {p.name for p in weights}
     for page in ("README.md", "docs/index.md"):
         text = " ".join((ROOT / page).read_text(encoding="utf-8").split())
         assert f"Licence: {PROJECT['license']}" in text
-        assert f"one small network that is included ({weights[0].stat().st_size / 1e6:.1f} MB" in text
+        assert f"two small networks that are included ({sizes} MB, of ours" in text
         for name, licence in COPYLEFT.items():
             assert f"`{name}` ({licence})" in text
 

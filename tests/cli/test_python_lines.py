@@ -77,5 +77,5 @@ def test_a_run_shows_its_own_names_alone() -> None:
     shown = {name for name in dir(msgs_slam.Run) if not name.startswith("_")}
     assert shown == {
         "classes", "depth", "draw", "gaussians", "image_paths", "intrinsics", "mesh", "metres_per_unit", "names",
-        "timestamps", "trajectory", "world_from_cam",
+        "things", "timestamps", "trajectory", "world_from_cam",
     }  # fmt: skip
