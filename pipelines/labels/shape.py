@@ -126,16 +126,19 @@ def _columns(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(V,) least and greatest height of the surface in the upright column around each voxel, and in those beside it."""
     cell = np.floor(voxels.position @ _flat_axes(up).T / (_COLUMN * voxels.size)).astype(np.int64)
-    cell -= cell.min(0, initial=0)
-    rows, columns = (cell.max(0, initial=0) + 1).tolist()
-    at = cell[:, 0] * columns + cell[:, 1]
-    out = []
-    for sign in (-1.0, 1.0):
-        best = np.full(rows * columns, -np.inf)
-        np.maximum.at(best, at, sign * height)
-        around = cv2.dilate(best.reshape(rows, columns), np.ones((3, 3), np.uint8))
-        out.append(sign * around.ravel()[at])
-    return out[0], out[1]
+    cell -= cell.min(0, initial=0) - 1
+    width = int(cell[:, 1].max(initial=0)) + 2
+    # Only what is filled is held: one far place would make a grid of everything between.
+    filled, at = np.unique(cell[:, 0] * width + cell[:, 1], return_inverse=True)
+    best = np.full((2, len(filled)), -np.inf)
+    for row, sign in zip(best, (-1.0, 1.0), strict=True):
+        np.maximum.at(row, at, sign * height)
+    around = best.copy()
+    for step in (a * width + b for a in (-1, 0, 1) for b in (-1, 0, 1)):
+        beside = np.searchsorted(filled, filled + step).clip(max=max(len(filled) - 1, 0))
+        there = filled[beside] == filled + step
+        around[:, there] = np.maximum(around[:, there], best[:, beside[there]])
+    return -around[0][at], around[1][at]
 
 
 def _behind(voxels: Voxels, up: NDArray[np.float64], away: float) -> NDArray[np.float64]:

@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 from proxy_room import UNIT, Room
 
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
+from msgs_slam.pipelines.geometry.voxels import Voxels
 from msgs_slam.pipelines.labels.named import ShapeLabels
 from msgs_slam.pipelines.labels.segments import Segments
-from msgs_slam.pipelines.labels.shape import CHANNELS, SIDE, RoomShape
+from msgs_slam.pipelines.labels.shape import CHANNELS, SIDE, RoomShape, _columns
 from msgs_slam.pipelines.providers import DepthEstimate
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Frame
@@ -81,3 +82,11 @@ def test_a_scene_without_any_surface_has_a_shape_all_the_same(room: Room) -> Non
     voxels, gravity, kind = labels.structure(room.frames[:2], depth_of)
     shape = RoomShape.of(voxels, gravity, kind, np.zeros((2, 3)))
     assert np.isfinite(shape.channels(room.sequence(), room.frames[0], depth_of(room.frames[0]))).all()
+
+
+def test_columns_reach_to_the_next_and_a_far_place_costs_nothing() -> None:
+    position = np.array([[0.5, 0.5, 1.0], [2.5, 0.5, 3.0], [0.5, 4.5, 2.0], [2e6, -2e6, 9.0]])
+    voxels = Voxels(1.0, np.arange(4), np.ones(4), position, np.tile([0.0, 0, 1], (4, 1)), np.zeros((4, 3)))
+    low, high = _columns(voxels, np.array([0.0, 0, 1]), position[:, 2])
+    assert low.tolist() == [1, 1, 2, 9]
+    assert high.tolist() == [3, 3, 2, 9]
