@@ -135,9 +135,9 @@ def _columns(
         np.maximum.at(row, at, sign * height)
     around = best.copy()
     for step in (a * width + b for a in (-1, 0, 1) for b in (-1, 0, 1)):
-        beside = np.searchsorted(filled, filled + step).clip(max=max(len(filled) - 1, 0))
-        there = filled[beside] == filled + step
-        around[:, there] = np.maximum(around[:, there], best[:, beside[there]])
+        place = np.searchsorted(filled, filled + step).clip(max=max(len(filled) - 1, 0))
+        there = filled[place] == filled + step
+        around[:, there] = np.maximum(around[:, there], best[:, place[there]])
     return -around[0][at], around[1][at]
 
 
