@@ -28,7 +28,7 @@ from ..system.values import dataclass_from_json
 from ..system.wording import quoted
 from ..types import VOID, Array
 from .light import clustered
-from .things import LARGEST, STRUCTURE, find_things, is_word
+from .things import LARGEST, STRUCTURE, find_things, is_word, of_faces
 
 _NAMED = 0.3
 """Share of a thing that bears a class's name, from which the thing is called so."""
@@ -175,9 +175,9 @@ def things_in(
     if seen.any():  # what no view sees is a surface that was completed
         renumbered = np.where(seen > 0, np.cumsum(seen > 0) - 1, -1)
         of_vertex, seen = np.append(renumbered, -1)[of_vertex], seen[seen > 0]
-    a, b, c = of_vertex[mesh.faces].T
-    of_face = np.where((a == b) | (a == c), a, np.where(b == c, b, -1))
-    parts = zip(_rows(of_vertex, len(seen)), _rows(of_face, len(seen)), seen.tolist(), strict=True)
+    parts = zip(
+        _rows(of_vertex, len(seen)), _rows(of_faces(of_vertex, mesh.faces), len(seen)), seen.tolist(), strict=True
+    )
     around = Surroundings.of(mesh, names, world, step)
     table = _kept([around.described(*part) for part in parts], old)
     numbers = np.array([*(t.number for t in table), 0], np.uint16)[of_vertex]

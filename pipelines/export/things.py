@@ -266,10 +266,15 @@ def _joined(parts: Parts, first: NDArray, second: NDArray, cost: Array, mass: Ar
     return group
 
 
+def of_faces(numbers: NDArray[np.int64], faces: NDArray[np.int32]) -> NDArray[np.int64]:
+    """(F,) the number that two corners of a face have, of the vertices' (V,); -1 for three different ones."""
+    a, b, c = numbers[faces].T
+    return np.where((a == b) | (a == c), a, np.where(b == c, b, -1))
+
+
 def _numbered(mesh: MeshArrays, group: NDArray[np.int64]) -> NDArray[np.int64]:
     """The groups (V,), -1 for none, that have enough faces, numbered from 0; a face is of what two corners are."""
-    a, b, c = group[mesh.faces].T
-    of_face = np.where((a == b) | (a == c), a, np.where(b == c, b, -1))
+    of_face = of_faces(group, mesh.faces)
     faces = np.bincount(of_face + 1, minlength=int(group.max(initial=-1)) + 2)[1:]
     order = np.argsort(-faces, kind="stable")[: int((faces >= MIN_FACES).sum())]
     number = np.full(len(faces) + 1, -1)

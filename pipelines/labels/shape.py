@@ -7,7 +7,6 @@ It learned on made rooms, where colour is made up and shape is not: colours only
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -16,16 +15,14 @@ from threading import Lock
 import cv2
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
-from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from ...formats.tensors import load_arrays
 from ..geometry.camera import resample_nearest, unproject_depth
 from ..geometry.sequence import Sequence, resize_area
 from ..geometry.voxels import CEILING, FLOOR, Gravity, Voxels, find_near, to_lab, voxel_keys
 from ..providers import DepthEstimate
+from ..system.unet import UNet
 from ..types import Frame
 
 WEIGHTS = Path(__file__).parent / "shape.npz"
@@ -159,45 +156,11 @@ def _behind(voxels: Voxels, up: NDArray[np.float64], away: float) -> NDArray[np.
     return out
 
 
-class _Block(nn.Module):
-    def __init__(self, before: int, after: int) -> None:
-        super().__init__()
-        self.one = nn.Conv2d(before, after, 3, padding=1, bias=False)
-        self.two = nn.Conv2d(after, after, 3, padding=1, bias=False)
-        self.n1, self.n2 = nn.BatchNorm2d(after), nn.BatchNorm2d(after)
-
-    def fuse(self) -> None:
-        """Take the normalisation into the convolutions, for a network that learns no more."""
-        for conv, norm in (("one", "n1"), ("two", "n2")):
-            setattr(self, conv, fuse_conv_bn_eval(getattr(self, conv), getattr(self, norm)))
-            setattr(self, norm, nn.Identity())
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.n2(self.two(self.n1(self.one(x)).relu_())).relu_()
-
-
-class ShapeNetwork(nn.Module):
-    """A U-Net over the channels of a keyframe."""
+class ShapeNetwork(UNet):
+    """Logits (B, NAMES, h, w) of the channels (B, CHANNELS, h, w) of keyframes."""
 
     def __init__(self) -> None:
-        super().__init__()
-        w = _WIDTHS
-        self.down = nn.ModuleList(_Block(a, b) for a, b in zip((CHANNELS, *w), w, strict=False))
-        self.up = nn.ModuleList(_Block(b + a, a) for a, b in itertools.pairwise(w))
-        self.out = nn.Conv2d(w[0], len(NAMES), 1)
-
-    def forward(self, planes: Tensor) -> Tensor:
-        """Logits (B, NAMES, h, w) of channels (B, CHANNELS, h, w)."""
-        height, width = planes.shape[2:]
-        x = F.pad(planes, (0, -width % 8, 0, -height % 8), mode="replicate")
-        stack = []
-        for level, down in enumerate(self.down):
-            x = down(x if level == 0 else F.avg_pool2d(x, 2))
-            stack.append(x)
-        stack.pop()
-        for up in reversed(self.up):
-            x = up(torch.cat([F.interpolate(x, scale_factor=2, mode="nearest"), stack.pop()], 1))
-        return self.out(x)[:, :, :height, :width]
+        super().__init__(CHANNELS, _WIDTHS, len(NAMES))
 
 
 _ONE_AT_A_TIME = Lock()
@@ -210,6 +173,5 @@ def load_shape_network() -> ShapeNetwork:
     weights = {k: torch.from_numpy(v.astype(np.float32)) for k, v in load_arrays(WEIGHTS).items()}
     network.load_state_dict(weights, strict=False)  # how many batches were seen is not kept
     network.eval()
-    for block in (b for b in network.modules() if isinstance(b, _Block)):
-        block.fuse()
+    network.fuse()
     return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -8,7 +8,6 @@ candidate gets its probability, a correction and a spread. So a pixel's depth is
 around each corrected candidate and one that the context gives by itself.
 """
 
-import itertools
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -20,10 +19,10 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from ....formats.tensors import load_arrays
 from ...geometry.voxels import to_lab
+from ...system.unet import UNet
 from .evidence import (
     FEATURES,
     KINDS,
@@ -121,37 +120,16 @@ def _lower_median(values: Array) -> np.float32:
     return np.float32(np.partition(values, middle)[middle])
 
 
-class _Block(nn.Module):
-    def __init__(self, before: int, after: int) -> None:
-        super().__init__()
-        self.one = nn.Conv2d(before, after, 3, padding=1, bias=False)
-        self.two = nn.Conv2d(after, after, 3, padding=1, bias=False)
-        self.n1, self.n2 = nn.BatchNorm2d(after), nn.BatchNorm2d(after)
-
-    def fuse(self) -> None:
-        """Take the normalisation into the convolutions, for a network that learns no more."""
-        for conv, norm in (("one", "n1"), ("two", "n2")):
-            setattr(self, conv, fuse_conv_bn_eval(getattr(self, conv), getattr(self, norm)))
-            setattr(self, norm, nn.Identity())
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.n2(self.two(self.n1(self.one(x)).relu_())).relu_()
-
-
-class CompletionNetwork(nn.Module):
+class CompletionNetwork(UNet):
     """The network; 439,022 weights."""
 
     def __init__(self) -> None:
-        super().__init__()
-        kinds, w = len(KINDS), _WIDTHS
-        self.first = nn.Linear(FEATURES + _BESIDE + kinds, _HIDDEN)
+        super().__init__(_PLANES + _BROUGHT + 1, _WIDTHS, 2 * _CONTEXT + 1)
+        self.first = nn.Linear(FEATURES + _BESIDE + len(KINDS), _HIDDEN)
         self.around, self.bring = nn.Linear(2 * _HIDDEN, _HIDDEN), nn.Linear(_HIDDEN, _BROUGHT)
         self.pixel = nn.Linear(_HIDDEN, _CONTEXT, bias=False)
         self.second, self.last = nn.Linear(_HIDDEN, _CONTEXT), nn.Linear(_CONTEXT, 3)
         self.alone = nn.Linear(_CONTEXT, 3)
-        self.down = nn.ModuleList(_Block(a, b) for a, b in zip((_PLANES + _BROUGHT + 1, *w), w, strict=False))
-        self.up = nn.ModuleList(_Block(b + a, a) for a, b in itertools.pairwise(w))
-        self.out = nn.Conv2d(w[0], 2 * _CONTEXT + 1, 1)
 
     def read(self, evidence: Tensor, place: Tensor, by_depth: Tensor, real: Tensor) -> Tensor:
         """Read candidates by numbers (P, K, OF_CANDIDATE), (P, OF_PLACE) and (P, K, 3): (P, K, hidden), 0 where there
@@ -175,15 +153,7 @@ class CompletionNetwork(nn.Module):
         values = F.relu(self.bring(gathered)).to(planes.dtype)
         brought[pixels] = torch.cat([values, torch.ones_like(values[:, :1])], 1)
         x = torch.cat([planes, brought.reshape(batch, height, width, -1).permute(0, 3, 1, 2)], 1)
-        x = F.pad(x, (0, -width % 8, 0, -height % 8), mode="replicate")
-        stack = []
-        for level, down in enumerate(self.down):
-            x = down(x if level == 0 else F.avg_pool2d(x, 2))
-            stack.append(x)
-        stack.pop()
-        for up in reversed(self.up):
-            x = up(torch.cat([F.interpolate(x, scale_factor=2, mode="nearest"), stack.pop()], 1))
-        return self.out(x)[:, :, :height, :width].permute(0, 2, 3, 1)
+        return self(x).permute(0, 2, 3, 1)
 
     def weigh(self, hidden: Tensor, real: Tensor, gathered: Tensor, context: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return log probability, correction of the log inverse depth and log spread (P, K + 1) of the candidates and
@@ -246,8 +216,7 @@ def load_network(device: str = "cpu") -> CompletionNetwork:
     weights = {k: torch.from_numpy(v.astype(np.float32)) for k, v in load_arrays(WEIGHTS).items()}
     network.load_state_dict(weights, strict=False)  # how many batches were seen is not kept
     network.eval()
-    for block in (b for b in network.modules() if isinstance(b, _Block)):
-        block.fuse()
+    network.fuse()
     # Convolutions take two thirds of the time with the channels last.
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return network.to(device)
