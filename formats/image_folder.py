@@ -106,7 +106,7 @@ def _why_no_images(folder: Path, files: list[Path]) -> str:
         more = f"{len(videos)} videos, such as {videos[0]}" if videos[1:] else f"the video {videos[0]}"
         return f"no images in {folder}, but {more}: give one of them, or the folder to `msgs-slam batch`"
     hint = hint_at_inner_folder(folder)
-    kinds = f"give the folder that directly holds the {', '.join(sorted(IMAGE_SUFFIXES))} files"
+    kinds = f"give the folder that holds the images themselves ({', '.join(sorted(IMAGE_SUFFIXES))})"
     return f"no images in {folder} ({len(files)} other files): {hint or kinds}"
 
 

@@ -46,7 +46,7 @@ def batch(
     folder: Path, out: Path, engine_name: str, address: str, shard: slice, config_file: Path | None,
     overrides: tuple[str, ...], until: str, output: Output, **given: str | int | None,
 ) -> None:  # fmt: skip
-    """Reconstruct every video, image folder and data set in FOLDER, each into its own run; failures stop nothing.
+    """Reconstruct every video, image folder and data set in FOLDER, each into its own run; the rest go on if one fails.
 
     Prints one table; the exit code is 1 if a recording failed, and RUNS/NAME.failed.txt says why. If interrupted, run
     the same command to continue. With --shard many machines share the work over one disk (SLURM arrays, Kubernetes

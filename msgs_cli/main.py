@@ -75,6 +75,9 @@ class FriendlyGroup(click.Group):
             ctx.fail(f"{args[0]!r} is no command; did you mean `msgs-slam {meant}`?")
         return super().resolve_command(ctx, args)
 
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Leave out the list: the help text has a line for every command."""
+
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command inside the one error boundary."""
         try:
@@ -138,7 +141,7 @@ def main() -> None:
     msgs-slam report video.msgs         one HTML page: what was found, how good, what to film better
     msgs-slam render video.msgs out.mp4 the map along its camera path
     msgs-slam view video.msgs           the map in the browser
-    msgs-slam evaluate video.msgs --truth DATASET    errors against a known truth
+    msgs-slam evaluate video.msgs ...   errors against ground truth
     msgs-slam models list               learned models for metric depth and named classes
     msgs-slam doctor                    check this machine and suggest fixes
     msgs-slam config                    every setting with its default and meaning

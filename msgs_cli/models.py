@@ -26,7 +26,7 @@ def _size(model: Model) -> str:
     return f"{model.bytes / 1e6:.1f} MB" if model.bytes else "size unknown"
 
 
-@models.command("list")
+@models.command("list", short_help="List the known models, what is installed, licences.")
 def list_models() -> None:
     """List the known models: which are installed, their sizes and licences.
 
@@ -54,7 +54,7 @@ def list_models() -> None:
     click.echo(f"cache: {store.cache}")
 
 
-@models.command()
+@models.command(short_help="Download models, by default the small ones (4 MB).")
 @click.argument("names", nargs=-1)
 @click.option(
     "--best", is_flag=True, help="The small ones and a large one for metric depth, free for all uses (145 MB)."
@@ -127,7 +127,7 @@ def _pull_one(store: ModelStore, model: Model, trust: bool, offline: bool) -> Pa
 @click.option(
     "--family",
     required=True,
-    help="Its family, as for example metric3d-community or moge.",
+    help="Its family, such as metric3d-community or moge.",
 )
 @click.option("--name", default="", help="Its name in the cache; by default the file's own.")
 def add(file: Path, family: str, name: str) -> None:
@@ -142,7 +142,7 @@ def add(file: Path, family: str, name: str) -> None:
     click.echo(f"{model.name}: sha256 {model.sha256}")
 
 
-@models.command()
+@models.command(short_help="Check every installed file against its hash.")
 def verify() -> None:
     """Check every installed file against its hash; exit code 1 if one is damaged.
 
@@ -152,8 +152,9 @@ def verify() -> None:
     from ..pipelines.networks.registry import ModelStore
 
     found = ModelStore.open().verify()
+    width = max(map(len, found))
     for name, state in found.items():
-        click.echo(f"{name:18} {state}")
+        click.echo(f"{name:{width}}  {state}")
     if any(state.startswith("damaged") for state in found.values()):
         raise SystemExit(1)
 

@@ -24,7 +24,7 @@ KEY_FIGURES = {
     "frames": ("frames", "keyframes_placed", "calibration", "focal_px", "focal_sd_px", "still_left_out", "gps"),
     "proxy": ("depth", "semantics", "metric", "metres_per_unit", "classes"),
     "tracking": ("posed", "keyframes", "lost", "links", "scale"),
-    "mapping": ("gaussians", "keyframe_psnr"),
+    "mapping": ("gaussians", "keyframe_psnr", "psnr_pixels"),
     "global_ba": ("images_posed", "keyframe_psnr"),
     "export": ("images", "vertices", "faces", "up", "floor", "gps"),
 }

@@ -34,6 +34,11 @@ if TYPE_CHECKING:
 __all__ = ["Found", "InputError", "Measured", "Poses", "Run", "__version__", "open_run", "reconstruct"]
 
 
+def __dir__() -> list[str]:
+    """The interface, without what this module imports."""
+    return [*__all__, "formats"]
+
+
 def __getattr__(name: str) -> str:
     """`__version__`, by what pip knows of the program: asking takes longer than the rest of this module."""
     if name != "__version__":

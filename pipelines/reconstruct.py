@@ -142,7 +142,7 @@ def reconstruct(
     this call is removed again when the source turns out to be unusable.
     """
     if (made := RunFolder(source)).manifest_file.is_file() and made.settings_file.is_file():
-        raise InputError(f"{source} is a run, no source: go on with it by `msgs-slam resume {quoted(source)}`")
+        raise InputError(f"{source} is a run, not a source: `msgs-slam resume {quoted(source)}` continues it")
     require_unicode(source.resolve())  # the manifest names it
     require_unicode(run.root.absolute())
     config = with_absolute_paths(config)
@@ -253,7 +253,7 @@ def _require_format(run: RunFolder, source: Path, digest: str, format: str) -> N
         return
     raise RecoverableError(
         f"run.format={format} reads other images, times or cameras from {source} than {was}, with which {run.root} was "
-        f"made: go on with --set run.format={was}, or make another run with --out NEW"
+        f"made: continue with --set run.format={was}, or make another run with --out NEW"
     )
 
 

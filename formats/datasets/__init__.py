@@ -106,7 +106,7 @@ def open_sequence(path: Path, format: str = "auto") -> Dataset:
             names, path = (above, path.resolve().parent) if above else (names, path)
         if not names:
             raise InputError(
-                f"{path} is none of the known data sets ({', '.join(_READERS)}): give the folder of one sequence, "
+                f"{path} has the layout of no known data set ({', '.join(_READERS)}): give the folder of one sequence, "
                 "or name the format"
             )
         sequence = _READERS[names[0]].open(path)

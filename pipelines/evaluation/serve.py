@@ -59,7 +59,7 @@ def progress_summary(run: RunFolder) -> str:
     shown = next((text for name, text in reversed(_SHOWING.items()) if name in records), "nothing yet")
     running = load_run_progress(run)
     if running is None:
-        what = f"{', '.join(left)}. No job is running: `msgs-slam resume {quoted(run.place.name)}` goes on"
+        what = f"{', '.join(left)}. No job is running: `msgs-slam resume {quoted(run.place.name)}` continues"
     else:
         what = ", ".join(f"{name} ({running.text})" if name == running.stage else name for name in left)
     return f"Shown: {shown} ({len(STAGES) - len(left)} of {len(STAGES)} stages done). Still to come: {what}."

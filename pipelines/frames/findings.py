@@ -342,9 +342,9 @@ def warn_of_defects(
     camera = straight.cameras[1]
     if gain > _MIN_GAIN and shift > _SHIFTED * max(camera.width, camera.height):
         context.warn(
-            f"images are shifted against the lens, each by another {shift:.0f} pixels or so, as electronic "
-            "stabilisation does, or a rolling shutter where the times of the images are unknown: the camera's path is "
-            "less certain than it looks. Switch stabilisation off; give the video itself, not images of it"
+            f"images are shifted relative to the lens, each differently, by about {shift:.0f} pixels: by electronic "
+            "stabilisation, or by a rolling shutter if their times are unknown. The camera's path is less certain "
+            "than it looks. Switch stabilisation off; give the video itself, not images of it"
         )
     return noise if noise > _NOISY else 0.0
 

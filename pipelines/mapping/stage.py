@@ -114,12 +114,14 @@ class MappingStage:
 
     def save_figures(self, keyframes: Sequence[ViewFigures], held_out: Sequence[ViewFigures]) -> dict[str, Any]:
         """Write the figures of keyframes and held-out frames, with the classes and the submaps."""
+        image = self.context.run.load(CALIBRATION).intrinsics.at_most(self.context.config.mapping.max_side)
         figures = {
             "keyframes": len(self.kept),
             "gaussians": len(self.result.gaussian_map),
             "submaps": len(self.submaps),
             "iterations": self.result.iterations,
             "classes": len(self.class_ids),
+            "psnr_pixels": max(image.width, image.height),  # on the long side; smaller images have more
             **mean_figures(keyframes, "keyframe"),
             **mean_figures(held_out, "held_out"),
         }

@@ -146,8 +146,8 @@ class NetworkPass:
         """Said once, after the first frames, when it will be long."""
         if seconds * left > _LONG:
             log.warning(
-                "%s: about %.0f minutes for %d more frames (%.1f s each); stopped, `msgs-slam resume` goes on. "
-                "Networks of other sizes are in `msgs-slam models list`: --depth NAME, --semantics NAME",
+                "%s: about %.0f minutes for %d more frames (%.1f s each); if interrupted, `msgs-slam resume` "
+                "continues. Networks of other sizes are in `msgs-slam models list`: --depth NAME, --semantics NAME",
                 self._name, seconds * left / 60, left, seconds,
             )  # fmt: skip
 

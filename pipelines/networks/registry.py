@@ -219,12 +219,12 @@ class ModelStore:
         return model
 
     def verify(self) -> dict[str, str]:
-        """Name → "ok", "not pulled" or what is wrong, for every model."""
+        """Name → "ok", "not installed" or what is wrong, for every model."""
         return {model.name: self._state(model) for model in self.models}
 
     def _state(self, model: Model) -> str:
         if not self.path(model).is_file():
-            return "not pulled"
+            return "not installed"
         if not model.sha256:
             return "no known sha256"
         return "ok" if self._is_whole(model) else "damaged: pull it again"
@@ -342,7 +342,8 @@ def _fetch_one(url: str, target: Path, size: int, sha256: str, progress: Callabl
         except requests.HTTPError as error:
             return f"the server answers {str(error).partition(' for url')[0]}"
         except requests.RequestException as error:
-            reason = str(error)
+            cause = getattr(error.args[0], "reason", error) if error.args else error  # without the address again
+            reason = re.sub(r"^\w+\(.*?\): ", "", str(cause))
         except (ValueError, InputError) as error:
             return str(error)
         except OSError as error:
@@ -391,4 +392,4 @@ def _require_safe(response: Any, *_: Any, **__: Any) -> None:
     location = urllib.parse.urljoin(response.url, response.headers.get("location", ""))
     own = (urllib.parse.urlsplit(response.url).hostname or "") in _OWN_HOSTS
     if response.is_redirect and not _is_safe(location, own):
-        raise InputError(f"the server sends on to {location[:200]}; only https is followed")
+        raise InputError(f"the server redirects to {location[:200]}; only https is followed")

@@ -80,8 +80,8 @@ def choose_semantics(config: ProxyConfig) -> Choice:
     if choice.card is None or choice.card.text is None:
         if config.classes:
             raise InputError(
-                "proxy.classes: a network that compares images with words finds them, --semantics onnx:CARD.toml "
-                f"whose card has `text`; {choice.card.name if choice.card else choice.kind} does not"
+                "proxy.classes: words of your own need a network that compares images with text: --semantics "
+                f"onnx:CARD.toml, whose card has `text`; {choice.card.name if choice.card else choice.kind} does not"
             )
         return choice
     return replace(choice, card=with_words(choice.card, config.classes))

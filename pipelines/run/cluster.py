@@ -33,7 +33,7 @@ _STARTS = 2
 _ANSWERS_WITHIN, _ENDS_WITHIN = 5.0, 20.0
 """Seconds: for an address to answer, for cancelled tasks to end by themselves."""
 _COMPUTE = ("torch", "numpy", "scipy", "pycolmap", "numba", "opencv-python-headless", "scikit-image")
-_GO_ON = "What the tasks have done is kept: the same command goes on, with --engine ray or without"
+_GO_ON = "What the tasks have done is kept: the same command continues, with --engine ray or without"
 
 
 class RayCluster:

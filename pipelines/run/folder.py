@@ -67,7 +67,7 @@ class RunFolder:
             return self
         what = "does not exist" if not self.root.exists() else "is not a run folder (it has no manifest.json)"
         near = f"; did you mean {' or '.join(map(str, found))}?" if (found := self._near()) else "."
-        raise InputError(f"{self.root} {what}{near} Runs are made by `msgs-slam reconstruct VIDEO`")
+        raise InputError(f"{self.root} {what}{near} `msgs-slam reconstruct VIDEO` creates a run")
 
     def _near(self, limit: int = 3) -> list[Path]:
         """Runs that may be meant where this is none: in it, around it, of the video that it is, of a like name."""

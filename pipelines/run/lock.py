@@ -114,6 +114,6 @@ def make_folder(root: Path) -> bool:
         return False
     except OSError as error:
         raise InputError(
-            f"{root} cannot be made ({error.strerror}). Choose another folder with --out FOLDER"
+            f"{root} cannot be created ({error.strerror}). Choose another folder with --out FOLDER"
         ) from error
     return True

@@ -18,6 +18,8 @@ from ...formats.reading import home_expanded, is_unicode
 from ...formats.textfile import read_toml
 from ..config import Config, allowed_values, meaning_of, range_text, value_of
 
+_WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
+
 
 class UnknownSettingError(SettingError):
     """There is no setting of that name."""
@@ -132,7 +134,7 @@ def _checked(value: Any, wanted: Any, choices: tuple[str, ...], where: str) -> A
     if wanted is str and not choices and isinstance(value, int | float) and not isinstance(value, bool):
         value = str(value)  # strings need no quotes, and a file's name may be a number
     if not isinstance(value, wanted) or (wanted is int and isinstance(value, bool)):
-        raise SettingError(f"{where} expects {wanted.__name__}, got {value!r:.80}")
+        raise SettingError(f"{where} expects {_WORDS[wanted]}, got {value!r:.80}")
     if isinstance(value, str) and not is_unicode(value):
         raise SettingError(f"{where} is no valid UTF-8, got {value!r:.80}: rename the file or folder")
     if choices and value not in choices:

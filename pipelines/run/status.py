@@ -52,9 +52,9 @@ class RunStatus:
     @property
     def warnings(self) -> list[str]:
         """Faults of the run itself, each with the command that repairs it."""
-        again = f"`msgs-slam resume {quoted(self.run.root)}` makes it and what follows again"
+        again = f"`msgs-slam resume {quoted(self.run.root)}` runs it and all later stages again"
         changed = [
-            f"{s.name} was made with other settings than run.toml asks for by now ({', '.join(s.changed)}): {again}"
+            f"{s.name} was made with other settings than run.toml now has ({', '.join(s.changed)}): {again}"
             for s in self.stages
             if s.changed
         ]
@@ -68,7 +68,7 @@ class RunStatus:
         ]
         file = self.run.settings_file
         gone = [] if file.exists() else [f"{file} is gone: stages that are not done get default settings"]
-        other = [f"{s.name} was made otherwise ({s.again}): {again}" for s in self.stages if s.again]
+        other = [f"{s.name} is out of date ({s.again}): {again}" for s in self.stages if s.again]
         return gone + changed + damaged + other
 
     @property

@@ -143,7 +143,7 @@ def _pack(world: World) -> dict[str, Any]:
     return {
         "axes": world.axes,
         "up": "z" if world.axes == "up" else "unknown",
-        "up_told_by": world.source,
+        "up_source": world.source,
         "floor_at_zero": world.has_floor,
         "unit": world.unit,
         "splats_from_exported": world.image_axes_from_exported.tolist(),
@@ -160,7 +160,7 @@ def _unpack(value: Any) -> World:
     rotation, translation = (np.array(move[name], dtype=np.float64) for name in ("rotation", "translation"))
     return World(
         axes=str(value["axes"]),
-        source=str(value["up_told_by"]),
+        source=str(value.get("up_source", "")),
         has_floor=bool(value["floor_at_zero"]),
         exported_from_run=Similarity(float(move["scale"]), rotation, translation),
         disagreement_deg={str(name): float(v) for name, v in value["degrees_from_up"].items()},

@@ -287,7 +287,7 @@ def test_a_run_is_no_source(tmp_path: Path) -> None:
     run = run_of(tmp_path / "room.msgs")
     refused = invoke("reconstruct", run.root)
     assert refused.exit_code == 1
-    assert f"is a run, no source: go on with it by `msgs-slam resume {run.root}`" in refused.stderr
+    assert f"is a run, not a source: `msgs-slam resume {run.root}` continues it" in refused.stderr
 
 
 def test_a_class_map_that_is_none_is_refused_before_the_run_is_looked_at(tmp_path: Path) -> None:

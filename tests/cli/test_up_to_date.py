@@ -116,8 +116,8 @@ def test_status_says_what_another_version_would_make_again(
     monkeypatch.setattr(stages, "package_digest", lambda: "new")
     before = contents(run)
     said = " ".join(invoke("status", run).stdout.split())
-    assert "frames was made otherwise (another version of the program made it" in said
-    assert f"`msgs-slam resume {run}` makes it and what follows again" in said
+    assert "frames is out of date (another version of the program made it" in said
+    assert f"`msgs-slam resume {run}` runs it and all later stages again" in said
     assert contents(run) == before
     resumed = invoke("resume", run, "--until", "frames", "-v")
     assert "frames and what follows are made again (another version of the program" in resumed.stderr
@@ -163,7 +163,7 @@ def test_another_format_is_not_called_another_source(finished_run: FinishedRun, 
     before = contents(run.root)
     refused = " ".join(invoke("resume", run.root, "--set", "run.format=images").stderr.split())
     assert "run.format=images reads other images, times or cameras" in refused
-    assert "go on with --set run.format=auto" in refused
+    assert "continue with --set run.format=auto" in refused
     assert contents(run.root) == before
 
 

@@ -268,7 +268,7 @@ def test_unknown_formats_and_places(tmp_path: Path) -> None:
         open_sequence(tmp_path, "repilca")
     with pytest.raises(InputError, match="no such file or folder"):
         open_sequence(tmp_path / "none")
-    with pytest.raises(InputError, match="none of the known"):
+    with pytest.raises(InputError, match="layout of no known data set"):
         open_sequence(tmp_path)
     Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg")
     assert open_sequence(tmp_path).format == "folder"

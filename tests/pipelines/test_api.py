@@ -76,7 +76,7 @@ def test_the_readers_on_the_page_read_an_export(
 
 def test_errors_say_what_to_do(tmp_path: Path) -> None:
     assert msgs_slam.InputError is InputError
-    with pytest.raises(InputError, match=r"no\.msgs does not exist\. Runs are made by `msgs-slam reconstruct VIDEO`"):
+    with pytest.raises(InputError, match=r"no\.msgs does not exist\. `msgs-slam reconstruct VIDEO` creates a run"):
         msgs_slam.open_run(tmp_path / "no.msgs")
     with pytest.raises(InputError, match="no such file"):
         msgs_slam.reconstruct(tmp_path / "none.mp4", tmp_path / "out.msgs")

@@ -132,7 +132,7 @@ def test_a_line_says_what_is_shown_and_what_is_to_come(run: RunFolder) -> None:
     assert line.startswith(
         "Shown: cameras and points after frames (2 of 6 stages done). Still to come: tracking, mapping"
     )
-    assert line.endswith(f"No job is running: `msgs-slam resume {run.root.name}` goes on.")
+    assert line.endswith(f"No job is running: `msgs-slam resume {run.root.name}` continues.")
     with locked(run), ProgressFile(SilentProgress(), run) as progress:
         progress.stage(StageEvent("tracking", 3, 6, BEGUN))
         assert progress_summary(run).endswith("Still to come: tracking (running), mapping, global_ba, export.")

@@ -281,6 +281,6 @@ def test_the_option_needs_a_network_that_knows_words(source: Path, tmp_path: Pat
     arguments = ["reconstruct", str(source), "--out", str(tmp_path / "run.msgs"), "--classes", "radiator, lamp"]
     found = CliRunner().invoke(main, arguments)
     assert found.exit_code == 1
-    assert "proxy.classes: a network that compares images with words" in found.stderr
+    assert "proxy.classes: words of your own need a network" in found.stderr
     assert "segments does not" in found.stderr
     assert not (tmp_path / "run.msgs" / "frames").exists()
