@@ -81,7 +81,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         for call in _after_write:
             call(path)
     except OSError as error:
-        if _is_of_another(error, path, temporary):
+        if _concerns_other_file(error, path, temporary):
             raise RecoverableError(
                 f"{os.fsdecode(error.filename)}: {error.strerror}, while writing {path.name}: check its rights"
             ) from error
@@ -140,7 +140,7 @@ def copy_file(source: Path, target: Path) -> None:
         shutil.copyfileobj(file, copy, _AT_ONCE)
 
 
-def _is_of_another(error: OSError, path: Path, temporary: Path) -> bool:
+def _concerns_other_file(error: OSError, path: Path, temporary: Path) -> bool:
     """Whether the system names a file that is read or written beside `path`, and the disk is not full."""
     if not isinstance(error.filename, str | bytes) or error.errno == errno.ENOENT or is_disk_full(error, path.parent):
         return False

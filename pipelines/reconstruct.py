@@ -33,7 +33,7 @@ from .run.progress import ProgressFile
 from .run.reads import StageRecord
 from .run.runner import run_stages
 from .run.settings import with_absolute_paths
-from .run.stages import Later, Stage, StageContext, TaskWorkers
+from .run.stages import LazyFunction, Stage, StageContext, TaskWorkers
 from .source.files import require_different
 from .source.recording import open_recording
 from .system.machine import available_cpus, require_device, submap_count, submap_size
@@ -53,18 +53,18 @@ _FIGURES = (("frames", "frames"), ("tracking", "posed"), ("tracking", "keyframes
 def all_stages(method: str = "default") -> list[Stage]:
     """The stages of a method (`run.method`) in order. Nothing that computes is imported before a stage runs."""
     between = [
-        Stage("tracking", Later("tracking.stage")),
-        Stage("mapping", Later("mapping.stage"), division=_mapping_division),
-        Stage("global_ba", Later("global_ba.stage")),
+        Stage("tracking", LazyFunction("tracking.stage")),
+        Stage("mapping", LazyFunction("mapping.stage"), division=_mapping_division),
+        Stage("global_ba", LazyFunction("global_ba.stage")),
     ]
     if method == "paper":
         names = {"tracking": "track_by_map", "mapping": "map_keyframes", "global_ba": "close_and_adjust"}
-        between = [Stage(stage, Later("paper.stages", name)) for stage, name in names.items()]
+        between = [Stage(stage, LazyFunction("paper.stages", name)) for stage, name in names.items()]
     return [
-        Stage("frames", Later("frames.stage"), check_frames, frames_division),
-        Stage("proxy", Later("proxy.stage"), check_proxy, check_settings=choose_providers),
+        Stage("frames", LazyFunction("frames.stage"), check_frames, frames_division),
+        Stage("proxy", LazyFunction("proxy.stage"), check_proxy, check_settings=choose_providers),
         *between,
-        Stage("export", Later("export.stage"), _check_export),
+        Stage("export", LazyFunction("export.stage"), _check_export),
     ]
 
 

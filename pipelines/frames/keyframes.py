@@ -138,7 +138,7 @@ def pick_frames(
             for message in stored["warnings"]:
                 context.warn(message)
             return frames
-    config, earlier = context.config.frames, len(context.warnings)  # those before are given again by who gave them
+    config, earlier = context.config.frames, len(context.warnings)  # earlier ones are repeated by their stage
     rate = config.rate if source.is_timed() else 0.0
     motion = Motion()
     frames = _saved(context, source, faces, keep_lossless, _sharpest(context, source, rate, motion))

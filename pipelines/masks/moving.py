@@ -2,7 +2,7 @@
 
 Depth and poses carry the surfaces of other keyframes into each one. Where several of them say what should be seen and
 the image shows another colour, something was there that was gone for them. A thing of the scene is there for the
-others too and explains itself, and over a surface of one colour nobody accuses anybody. A thing close to the camera may
+others too and explains itself, and a surface of one colour gives no evidence. A thing close to the camera may
 lie outside what the others see: at first only those accuse that have its place in sight. RobustNeRF (Sabour et al.,
 CVPR 2023) too leaves out what the rest of the views does not agree on, there while a map is fitted.
 """

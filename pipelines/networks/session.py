@@ -54,7 +54,7 @@ class Network:
         if kind is None or not issubclass(kind, np.floating):
             raise InputError(f"{card.model}: input {card.input} is not of float or float16. Correct the card")
         self._dtype = kind
-        # A bonus: exports of the same family without them work as well.
+        # Optional: exports of the same family without them work as well.
         self._extras = {k: n for k, n in bonus.items() if n in outputs}
         if card.metadata:
             self.card = card = _with_metadata(card, self._runtime.metadata)

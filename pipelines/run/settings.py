@@ -30,8 +30,8 @@ def load_config(
 ) -> Config:
     """The settings of `base` (or the defaults), changed by a TOML file and then by `section.key=value` texts.
 
-    A `quality` (of --quality; else run.quality of a text, else of the file) changes first what it has another value
-    for and nobody has chosen; what else is in the file and the texts is laid over that. A file that says its quality,
+    A `quality` (of --quality; else run.quality of a text, else of the file) first sets all settings that were not set
+    explicitly; what else is in the file and the texts is laid over that. A file that says its quality,
     as one that `msgs-slam config` prints, is taken as a whole for what --quality or a text then changes.
     Raises InputError for an unreadable file, an unknown key (with the nearest known one) or a value of a wrong type.
     """

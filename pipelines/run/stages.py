@@ -161,7 +161,7 @@ def in_chunks(
 
 
 @dataclass(frozen=True)
-class Later:
+class LazyFunction:
     """A function of a module below pipelines/ that is imported when it is called, so that `status` starts fast."""
 
     module: str
@@ -198,7 +198,7 @@ class Stage:
     def program(self) -> str:
         """Identity of what computes it: the package and, as methods differ, the function."""
         of = self.run
-        return f"{package_digest()} {f'{of.module}.{of.name}' if isinstance(of, Later) else self.name}"
+        return f"{package_digest()} {f'{of.module}.{of.name}' if isinstance(of, LazyFunction) else self.name}"
 
 
 def stopping_after_writes(folder: Path) -> AbstractContextManager[None]:

@@ -169,8 +169,8 @@ stands, not which one is better. DROID-SLAM with an unknown camera gets its foca
 """
 
 _RUN_HERE = """\
-Each from its images alone until all are posed, with the three small networks. Metres: estimated over true metres per
-unit; then by how many of its own standard deviations the estimate is off."""
+Each from its images alone until all are posed, with the three small networks. Metres: estimated over true metres
+per unit, with the stated standard deviation, and by how many of these it is off (if honest, below 2 in 19 of 20)."""
 
 
 def page(kept: dict[str, Any]) -> str:

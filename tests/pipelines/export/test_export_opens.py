@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from msgs_slam.pipelines.config import ExportConfig
+from msgs_slam.pipelines.export.kinds import EXPORTS
 from msgs_slam.pipelines.export.stage import WIDTH, export_run
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.sparse_model import SparseModel
@@ -193,6 +194,34 @@ def test_opensplat(folder: Path) -> None:
     head, body = data.split(b"end_header\n", 1)
     count = header_as_opensplat_reads_it(head.decode().splitlines())
     assert len(body) == count * (3 * 4 + 3 * 4 + 3) > 0
+
+
+def test_brush(folder: Path) -> None:
+    """ArthurBrussee/brush, crates/brush-dataset/src/formats: colmap.rs and mod.rs.
+
+    Of all models below the folder that of the most images, binary before text; an image is the first file whose path
+    ends in its name, outside of masks/; its mask has its name or stem there. It starts from the last of all PLY files,
+    whatever is in them: that must be the points, not the mesh or the map.
+    """
+    files = [p.relative_to(folder) for p in folder.rglob("*") if p.is_file()]
+    models = [p for p in files if p.name in ("cameras.bin", "cameras.txt")]
+    counts = {p: pycolmap.Reconstruction(str(folder / p.parent)).num_reg_images() for p in models}
+    chosen = min(models, key=lambda p: (-counts[p], p))
+    assert chosen == Path("sparse/0/cameras.bin")
+    model = pycolmap.Reconstruction(str(folder / chosen.parent))
+    for image in model.images.values():
+        found = min(p for p in files if p.as_posix().endswith(image.name) and "masks" not in p.parts)
+        assert found == Path("images", image.name)
+        assert Image.open(folder / found).size == (image.camera.width, image.camera.height)
+        assert image.camera.model.name == "PINHOLE"
+    images = {name for p in files if p.parts[0] == "images" for name in (p.name, p.stem)}
+    assert {p.stem for p in files if p.parts[0] == "masks"} <= images
+    written = {Path(file.name) for kind in EXPORTS for file in kind.files if file.name.endswith(".ply")}
+    start = max(written | {p for p in files if p.suffix == ".ply"})
+    assert start == Path("sparse/0/points3D.ply")
+    assert Path("mesh.ply") in written
+    ply = plyfile.PlyData.read(str(folder / start))["vertex"]
+    assert [ply.ply_property(n).val_dtype for n in ("x", "red", "green", "blue")] == ["f4", "u1", "u1", "u1"]
 
 
 def test_the_semantic_map_has_classes_and_no_probabilities(folder: Path) -> None:

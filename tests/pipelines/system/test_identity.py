@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from msgs_slam.pipelines.reconstruct import all_stages
-from msgs_slam.pipelines.run.stages import Later
+from msgs_slam.pipelines.run.stages import LazyFunction
 from msgs_slam.pipelines.system.identity import package_digest
 
 
@@ -32,5 +32,5 @@ def test_any_change_of_sources_or_data_is_another_digest_and_nothing_else_is(tmp
 @pytest.mark.parametrize("method", ["default", "paper"])
 def test_every_stage_names_a_function_that_there_is(method: str) -> None:
     for stage in all_stages(method):
-        assert isinstance(stage.run, Later)
+        assert isinstance(stage.run, LazyFunction)
         assert callable(stage.run.function)
