@@ -71,8 +71,8 @@ def match_truth(
     if alike.get(best, 0.0) < _ALIKE:
         without = "its images have no times" if is_timed else "the images of the run have no times"
         raise InputError(
-            f"{sequence.root}: {without}, and neither the names nor the numbers of its {len(sequence)} images "
-            f"({sequence.names[0]} first) lead to images of the run ({frames[0].name} first) that look the same. "
+            f"{sequence.root}: {without}, and neither the names nor the numbers of its images ({len(sequence)}, "
+            f"{sequence.names[0]} first) lead to images of the run ({frames[0].name} first) that look the same. "
             + ("Add timestamps.txt with the seconds of each image, or name" if is_timed else "Name")
             + " the images as the run's are"
         )
