@@ -101,7 +101,7 @@ EXPORTS = (
         "colmap.write_colmap", settings=("image_side",), when="always", also=("nerfstudio", "transforms"),
     ),
     Export(
-        "depth", "the same data set with a depth map for each image",
+        "depth", "the same data set with a depth and a normal map for each image",
         (
             ExportedFile(
                 "depth/",
@@ -110,6 +110,12 @@ EXPORTS = (
                 "transforms.json names them (depth_file_path)",
                 "nerfstudio (ns-train depth-nerfacto --data THIS_FOLDER)",
                 ("depth", IMAGES, "sparse", "masks", "transforms.json"),
+            ),
+            ExportedFile(
+                "normals/",
+                "beside depth/: NAME.png for the image NAME, the unit normals n of the map that face the camera, in "
+                "its axes (x right, y down, z forward), 127.5 (n + 1) in red, green and blue; black is unknown",
+                "trainers that take normals",
             ),
         ),
         "depth.write_depth", settings=("image_side",),

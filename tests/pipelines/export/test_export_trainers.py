@@ -20,7 +20,8 @@ from msgs_slam.pipelines.export import colmap
 from msgs_slam.pipelines.export.stage import export_run
 from msgs_slam.pipelines.geometry.camera import project
 from msgs_slam.pipelines.geometry.sparse_model import FrameObservations, SparseModel
-from msgs_slam.pipelines.run.files import FRAME_OBSERVATIONS, LEFT_OUT, SPARSE
+from msgs_slam.pipelines.geometry.voxels import normals_in_cam
+from msgs_slam.pipelines.run.files import CALIBRATION, FRAME_OBSERVATIONS, LEFT_OUT, SPARSE
 from msgs_slam.pipelines.run.folder import RunFolder
 from msgs_slam.pipelines.run.outcome import load_outcome
 from msgs_slam.pipelines.scene.world import WORLD, World
@@ -171,6 +172,13 @@ def test_depth_maps_are_named_and_true(oracle_run: OracleRun, truth: Dataset, tm
         both = (depth > 0) & (true > 0)
         assert both.mean() > 0.6
         assert 0 < np.median(np.abs(depth - true)[both] / true[both]) < 0.02
+        normals = read_rgb(tmp_path / "out" / "normals" / f"{truth.names[i]}.png") / 127.5 - 1
+        wanted = normals_in_cam(true.astype(np.float32), run.load(CALIBRATION).intrinsics)
+        known = (normals > -1).any(-1) & wanted.any(-1)
+        cosine = (normals * wanted).sum(-1)[known]
+        assert known.mean() > 0.6
+        assert abs(np.linalg.norm(normals[known], axis=-1) - 1).max() < 0.01
+        assert 0.95 < np.median(cosine) < 1
     assert pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0").num_images() == len(truth.names)
 
 
