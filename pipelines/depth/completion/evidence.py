@@ -262,29 +262,57 @@ def _ask_views(
     out: Bytes,
 ) -> None:
     """Features 3 to 12: shares of views that see the depth on, before or behind theirs, and colours there."""
-    views, width, votes, ray = len(seen), seen.shape[2], np.zeros(9), np.zeros((len(seen), 3))
+    # One function, whose sums are numbers and no arrays: at a quarter of the time.
+    views, height, width = seen.shape
+    ray = np.zeros((views, 3))
     for p in range(len(pixels)):
         y, x = pixels[p] // width, pixels[p] % width
         for v in range(views):
             for i in range(3):
                 ray[v, i] = warps[v, i, 0] * (x + 0.5) + warps[v, i, 1] * (y + 0.5) + warps[v, i, 2]
         for k in range(inverse.shape[1]):
-            alike = _earlier(inverse, p, k)
-            if inverse[p, k] <= 0 or alike >= 0:
+            alike, w = _earlier(inverse, p, k), np.float64(inverse[p, k])
+            if w <= 0 or alike >= 0:
                 for n in range(3, OF_CANDIDATE):
                     out[p, k, n] = out[p, alike, n] if alike >= 0 else 0
                 continue
-            for n in range(8):
-                votes[n] = 0.0
-            votes[8] = 2.0
+            on, through, behind, weakly_on, weakly_through = 0.0, 0.0, 0.0, 0.0, 0.0
+            inside, shown, summed, least = 0.0, 0.0, 0.0, 2.0
             for v in range(views):
-                _vote(v, 1 / np.float64(inverse[p, k]), ray, warps, lab, y, x, seen, trust, colors, votes)
-            inside, shown = max(votes[5], 1.0), votes[6]
-            for n in range(5):  # on, through, behind, weakly on, weakly through
-                out[p, k, 3 + n] = _as_byte(votes[n] / inside)
-            out[p, k, 8], out[p, k, 9] = _as_byte(votes[5] / views), _as_byte(shown / inside)
-            out[p, k, 10] = _as_byte(votes[7] / shown if shown > 0 else 1.0)
-            out[p, k, 11], out[p, k, 12] = _as_byte(votes[8]), _as_byte(min(votes[0], 3.0) / 3)
+                qz = ray[v, 2] + w * warps[v, 2, 3]  # the depth there over that here
+                if qz <= 1e-6:
+                    continue
+                qx, qy = (ray[v, 0] + w * warps[v, 0, 3]) / qz - 0.5, (ray[v, 1] + w * warps[v, 1, 3]) / qz - 0.5
+                left, top = int(np.floor(qx)), int(np.floor(qy))
+                if left < 0 or top < 0 or left + 1 >= width or top + 1 >= height:
+                    continue
+                inside += 1
+                fx, fy, apart = qx - left, qy - top, 0.0
+                there = seen[v, top + (fy >= 0.5), left + (fx >= 0.5)]
+                ratio = qz * there / w  # of the depths
+                if there > 0 and trust[v, top + (fy >= 0.5), left + (fx >= 0.5)] >= SURE:
+                    on += abs(ratio - 1) < 0.02
+                    through += ratio < 0.97
+                    if ratio > 1.03:
+                        behind += 1
+                        continue
+                elif there > 0:
+                    weakly_on += abs(ratio - 1) < 0.02
+                    weakly_through += ratio < 0.95
+                for c in range(3):
+                    above = colors[v, top, left, c] * (1 - fx) + colors[v, top, left + 1, c] * fx
+                    below = colors[v, top + 1, left, c] * (1 - fx) + colors[v, top + 1, left + 1, c] * fx
+                    step = above * (1 - fy) + below * fy - lab[y, x, c]
+                    apart += step * step * (0.5 if c == 0 else 1.0)
+                apart = min(np.sqrt(apart) / 20, 2.0)
+                shown, summed, least = shown + 1, summed + apart, min(least, apart)
+            total = max(inside, 1.0)
+            numbers = (
+                on / total, through / total, behind / total, weakly_on / total, weakly_through / total, inside / views,
+                shown / total, summed / shown if shown > 0 else 1.0, least, min(on, 3.0) / 3,
+            )  # fmt: skip
+            for n in range(len(numbers)):
+                out[p, k, 3 + n] = _as_byte(numbers[n])
 
 
 @kernel
@@ -294,52 +322,3 @@ def _earlier(inverse: Array, p: int, k: int) -> int:
         if abs(inverse[p, m] - inverse[p, k]) < _SAME * inverse[p, k]:
             return m
     return -1
-
-
-@kernel
-def _vote(
-    v: int,
-    z: float,
-    ray: NDArray[np.float64],
-    warps: NDArray[np.float64],
-    lab: Array,
-    y: int,
-    x: int,
-    seen: Array,
-    trust: Array,
-    colors: Array,
-    votes: NDArray[np.float64],
-) -> None:
-    """Add what view v says of depth z along the ray of a pixel."""
-    # Whole arrays are passed: each part of one is an object to numba, and counting its references takes longest.
-    height, width = seen.shape[1:]
-    qz = z * ray[v, 2] + warps[v, 2, 3]
-    if qz <= 1e-6 * z:
-        return
-    qx, qy = (z * ray[v, 0] + warps[v, 0, 3]) / qz - 0.5, (z * ray[v, 1] + warps[v, 1, 3]) / qz - 0.5
-    left, top = int(np.floor(qx)), int(np.floor(qy))
-    if left < 0 or top < 0 or left + 1 >= width or top + 1 >= height:
-        return
-    votes[5] += 1
-    near_y, near_x = int(np.floor(qy + 0.5)), int(np.floor(qx + 0.5))
-    if seen[v, near_y, near_x] > 0:
-        ratio = qz * seen[v, near_y, near_x]  # of the depths
-        if trust[v, near_y, near_x] >= SURE:
-            votes[0] += abs(ratio - 1) < 0.02
-            votes[1] += ratio < 0.97
-            if ratio > 1.03:
-                votes[2] += 1
-                return
-        else:
-            votes[3] += abs(ratio - 1) < 0.02
-            votes[4] += ratio < 0.95
-    fx, fy, apart = qx - left, qy - top, 0.0
-    for c in range(3):
-        above = colors[v, top, left, c] * (1 - fx) + colors[v, top, left + 1, c] * fx
-        below = colors[v, top + 1, left, c] * (1 - fx) + colors[v, top + 1, left + 1, c] * fx
-        step = above * (1 - fy) + below * fy - lab[y, x, c]
-        apart += step * step * (0.5 if c == 0 else 1.0)
-    apart = min(np.sqrt(apart) / 20, 2.0)
-    votes[6] += 1
-    votes[7] += apart
-    votes[8] = min(votes[8], apart)

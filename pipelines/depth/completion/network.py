@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from ....formats.tensors import load_arrays
 from ...geometry.voxels import to_lab
+from ...system.jit import kernel
 from ...system.unet import UNet
 from .evidence import (
     FEATURES,
@@ -232,15 +233,21 @@ HALF, TWICE = np.diag([0.5, 0.5, 1]), np.diag([2.0, 2, 1, 1])
 def halved(depth: Array, confidence: Array, image: NDArray[np.uint8], contrast: Array) -> HalfResKeyframe:
     """Reduce depth, confidence and contrast (H, W) to the size of the image (H/2, W/2, 3), both rounded up."""
     height, width = image.shape[:2]
-    pad = ((0, 2 * height - depth.shape[0]), (0, 2 * width - depth.shape[1]))
-    blocks = []
-    for values in (depth, np.where(depth > 0, confidence, 0)):
-        whole = np.pad(values, pad, mode="edge").reshape(height, 2, width, 2)
-        blocks.append(whole.transpose(0, 2, 1, 3).reshape(height, width, 4))
-    best = blocks[1].argmax(-1)[..., None]
-    found, sure = (np.take_along_axis(b, best, -1)[..., 0] for b in blocks)
+    inverse, sure = np.zeros((height, width), np.float32), np.full((height, width), -1, np.float32)
+    _keep_surest(depth, confidence, inverse, sure)
     small = np.asarray(cv2.resize(contrast, (width, height), interpolation=cv2.INTER_AREA), np.float32)
-    return HalfResKeyframe(invert(found), sure.astype(np.float32), image, to_lab(image), small)
+    return HalfResKeyframe(inverse, sure, image, to_lab(image), small)
+
+
+@kernel
+def _keep_surest(depth: Array, confidence: Array, inverse: Array, sure: Array) -> None:
+    """Of up to four pixels each: inverse depth and confidence of the surest, the first of those."""
+    for y in range(depth.shape[0]):
+        for x in range(depth.shape[1]):
+            own = confidence[y, x] if depth[y, x] > 0 else np.float32(0)
+            if own > sure[y // 2, x // 2]:
+                sure[y // 2, x // 2] = own
+                inverse[y // 2, x // 2] = np.float32(1) / depth[y, x] if depth[y, x] > 0 else np.float32(0)
 
 
 def complete(inputs: CompletionInputs, device: str) -> tuple[Array, Array]:

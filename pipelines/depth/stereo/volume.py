@@ -184,7 +184,7 @@ def smooth_cost(
     return total
 
 
-@lru_cache(maxsize=2 * len(DIRECTIONS))
+@lru_cache(maxsize=4 * len(DIRECTIONS))
 def path_starts(height: int, width: int, dy: int, dx: int) -> NDArray[np.int64]:
     """(S, 2) row and column of the first pixel of every path of a direction; each pixel lies on exactly one path."""
     y, x = np.mgrid[:height, :width]
