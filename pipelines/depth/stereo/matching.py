@@ -20,7 +20,7 @@ SMALL_STEP, JUMP, EDGE = 0.1, 1.2, 0.05
 STIFFNESS = 0.01
 REACH, MOVE = 2, 1 / 3
 """Of the refinement: so many moves either way, of so much of the distance between planes."""
-MARGIN, AROUND, CLEAR = 2, 1, 0.2
+MARGIN, AROUND, CLEAR = 1, 1, 0.2
 """Of the whole size: planes on either side of a coarse one that are tried, coarse pixels around it that try it, and the
 cost below which a match is clear by itself."""
 LARGE = 200
@@ -52,7 +52,7 @@ def match_planes(images: StereoImages, planes: NDArray[np.float64], bands: Bands
     """(H, W) inverse depth of the image, found among the inverse depths `planes` (D,), which are evenly spaced, and
     refined.
 
-    Planes are tried near those of a match at half the size own: an eighth of them.
+    Planes are tried near those of a match at half the size own: a twelfth of them.
     """
     step, best = planes[1] - planes[0], best_count(len(images.others))
     cost = sweep_cost(*images, planes, best, bands, _planes_near(images, planes, SMALL_STEP, bands))
