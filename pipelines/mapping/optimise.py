@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..config import MappingConfig
 from ..geometry.posed_depth import overlaps
-from ..render.api import Rendering, blending_weights, class_weights, in_view, marked_in_view, project_map, render
+from ..render.api import Rendering, class_weights, in_view, marked_in_view, project_map, render
 from ..render.gaussian_map import GaussianMap
 from ..render.rules import GaussianStats
 from ..system import gpu
@@ -313,32 +313,30 @@ class MapOptimiser:
     def solve_colors(self) -> None:
         """Move the colours towards those that all views together want, all else given: the first step of conjugate
         gradients (Hestenes and Stiefel 1952) of linear least squares, scaled by the pixels that each fills."""
-        colors, gaussian_map = self.state.parameters["colors"].detach(), self.state.parameters.to_map()
-        if len(colors) == 0:
-            return
-        filled = torch.full_like(colors[:, :1], _HARDLY_SEEN)
+        colors = self.state.parameters["colors"].detach()
+        left, filled = torch.zeros_like(colors), torch.full_like(colors[:, :1], _HARDLY_SEEN)
         for index, view in enumerate(self.views):
-            filled[:, 0] += blending_weights(gaussian_map, self.state.cam_from_world(index, view), view.intrinsics)[0]
-        left = self._pulled_back(colors, True)
+            rows, own, shown, stats = self._shown(index, view, colors)
+            stats.errors = torch.ones_like(shown[..., 0])
+            wanted = view.of_scene(view.colors - self.state.exposures[index, 1] - shown.detach())
+            left.index_add_(0, rows, torch.autograd.grad(shown, own, wanted)[0])
+            filled.index_add_(0, rows, stats.error_share[:, None])
         way = left / filled
-        share = (left * way).sum() / (way * self._pulled_back(way, False)).sum().clamp(min=1e-30)
         with torch.no_grad():
-            self.state.parameters["colors"].add_(share * way)
+            seen = (view.of_scene(self._shown(index, view, way)[2]) for index, view in enumerate(self.views))
+            squared = torch.stack([image.square().sum() for image in seen]).sum().clamp(min=1e-30)
+            self.state.parameters["colors"].add_((left * way).sum() / squared * way)
 
-    def _pulled_back(self, colors: Tensor, is_compared: bool) -> Tensor:
-        """(M, 3) each Gaussian's sum, over its pixels of all views and by its weight there, of what `colors` (M, 3)
-        show, or of the photographs less that."""
-        total, fixed = torch.zeros_like(colors), {k: self.state.parameters[k].detach() for k in KEYS}
-        for index, view in enumerate(self.views):
-            pose = self.state.cam_from_world(index, view)
-            rows = in_view(fixed["means"], torch.exp(fixed["log_radii"]), pose, view.intrinsics)
-            values = {k: v.index_select(0, rows) for k, v in {**fixed, "colors": colors}.items()}
-            gain, offset = torch.exp(self.state.exposures[index, 0]), self.state.exposures[index, 1]
-            drawn = self.draw(view, pose, {**values, "colors": values["colors"].requires_grad_()})
-            shown = drawn.features[..., :3] * gain
-            wanted = view.colors - offset - shown.detach() if is_compared else shown.detach()
-            total.index_add_(0, rows, torch.autograd.grad(shown, values["colors"], view.of_scene(wanted))[0])
-        return total
+    def _shown(self, index: int, view: View, colors: Tensor) -> tuple[Tensor, Tensor, Tensor, GaussianStats]:
+        """Indices (n,) of the Gaussians in view, their rows of `colors` (M, 3), and the image (H, W, 3) of these in the
+        view's exposure, less its offset; the statistics are filled by the way back from there."""
+        fixed, stats = {k: self.state.parameters[k].detach() for k in KEYS}, GaussianStats()
+        pose = self.state.cam_from_world(index, view)
+        rows = in_view(fixed["means"], torch.exp(fixed["log_radii"]), pose, view.intrinsics)
+        values = {k: v.index_select(0, rows) for k, v in {**fixed, "colors": colors}.items()}
+        own = values["colors"].requires_grad_()
+        drawn = self.draw(view, pose, values, stats)
+        return rows, own, drawn.features[..., :3] * torch.exp(self.state.exposures[index, 0]), stats
 
     @torch.no_grad()
     def count_labels(self) -> None:
