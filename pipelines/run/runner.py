@@ -15,12 +15,12 @@ from ...formats.errors import DiskFullError, InputError, RecoverableError
 from ...formats.reading import links_in
 from ..config import STAGES
 from ..system.machine import release_free_memory
-from ..system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, Progress, StageEvent, log, stop_if_asked
+from ..system.progress import BEGUN, ENDED, REFUSED, STOPPED, UP_TO_DATE, StageEvent, log, stop_if_asked
 from ..system.wording import quoted
 from .ending import empty, find_sealed, move_in, results, seal, unseal
 from .folder import RunFolder
 from .manifest import Manifest, Source, content_digest, finite_or_none, recorded_config, settings_of, write_manifest
-from .progress import TimeLeft
+from .progress import TimeLeft, in_pieces
 from .reads import ReadLog, Situation, StageRecord, begin_log, reads_in, watched
 from .stages import Stage, StageContext, stopping_after_writes
 
@@ -50,7 +50,7 @@ def run_stages(
         book.save()
     run.save_settings(config)
     settled = replace(config, run=replace(config.run, threads=config.run.threads or threads))
-    reporter = StageReporter(work.progress, wanted, records, settled.run.threads)
+    reporter = StageReporter(work, wanted, records, settled.run.threads)
     for stage in wanted:
         record, now = book.find(stage.name), Situation(stage.program, digest, config, records)
         why = "" if record is None else rerun_reason(stage, run, record, now)
@@ -130,10 +130,12 @@ class StageReporter:
     """Reports the stages as they begin and end, and how long the rest will take."""
 
     def __init__(
-        self, progress: Progress, wanted: Sequence[Stage], records: Mapping[str, StageRecord], threads: int
+        self, work: StageContext, wanted: Sequence[Stage], records: Mapping[str, StageRecord], threads: int
     ) -> None:
-        self._progress, self._names, self._threads = progress, [stage.name for stage in wanted], threads
-        self._left = TimeLeft({name: records[name].seconds for name in self._names if name in records}, self._names)
+        self._progress, self._names, self._threads = work.progress, [stage.name for stage in wanted], threads
+        taken = {name: records[name].seconds for name in self._names if name in records}
+        pieces = in_pieces(records["tracking"].figures) if "tracking" in records else 0.0
+        self._left = TimeLeft(taken, self._names, work.config.run.quality == "draft", pieces)
 
     def report(self, name: str, state: str, record: StageRecord | None = None) -> None:
         """Report that a stage has come into a state."""
@@ -151,7 +153,7 @@ class StageReporter:
         self.report(name, BEGUN)
 
         def ended(record: StageRecord) -> None:
-            self._left.end(name, record.seconds)
+            self._left.end(name, record.seconds, record.figures)
             self.report(name, ENDED, record)
 
         try:

@@ -48,9 +48,10 @@ class StageEvent:
 
     @property
     def left_text(self) -> str:
-        """; about 4 min left, or nothing. While only the first stage has ended, half or twice as long is as likely."""
-        ended, seconds = self.index - (self.state == BEGUN), self.left()
-        return f"; {about(seconds) if ended > 1 else between(seconds / 2, 2 * seconds)} left" if seconds else ""
+        """; 3 to 5 min left, or nothing. While only the first stage has ended, half or twice as long is as likely."""
+        ended, seconds = self.index - (self.state == BEGUN), self.left() or 0.0
+        low, high = (0.75, 1.25) if ended > 1 else (0.5, 2)
+        return f"; {between(low * seconds, high * seconds)} left" if seconds else ""
 
 
 def about(seconds: float) -> str:

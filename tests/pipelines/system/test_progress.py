@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from msgs_slam.msgs_cli.output import BarProgress
+from msgs_slam.pipelines.config import STAGES
 from msgs_slam.pipelines.run.progress import TimeLeft
 from msgs_slam.pipelines.system.progress import (
     BEGUN,
@@ -28,22 +29,28 @@ def event(state: str, left: Callable[[], float | None] = lambda: 240.0) -> Stage
 def test_time_left_follows_what_stages_have_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
-    left = TimeLeft({}, ("frames", "proxy", "tracking", "mapping", "global_ba", "export"))
+    left = TimeLeft({}, STAGES)
     left.begin("frames")
     assert left.left() is None, "nothing is known of this machine yet"
-    left.end("frames", 16.0)
-    assert left.left() == pytest.approx(84.0), "frames are 16 of 100"
+    left.end("frames", 20.0, {})
+    assert left.left() == pytest.approx(80.0), "frames are 20 of 100"
     left.begin("proxy")
     now[0] = 23.0
-    assert left.left() == pytest.approx(84.0 - 23.0)
+    assert left.left() == pytest.approx(80.0 - 23.0)
     now[0] = 1000.0
-    assert left.left() == pytest.approx(84.0 - 33.0 + 3.3), "late, and not over yet"
-    left.end("proxy", 66.0)
-    assert left.left() == pytest.approx(51.0 * 82 / 49), "slower than thought, so is the rest"
-    resumed = TimeLeft({"frames": 32.0, "proxy": 66.0, "tracking": 10.0}, ("frames", "proxy", "tracking"))
+    assert left.left() == pytest.approx(80.0 - 28.0 + 2.8), "late, and not over yet"
+    left.end("proxy", 56.0, {})
+    assert left.left() == pytest.approx(52.0 * (56 + 10) / (28 + 10)), "slower than thought, so is the rest"
+    left.begin("tracking")
+    left.end("tracking", 5.0, {"posed": 100, "pieces": [30, 20]})
+    assert left.left() == pytest.approx((47 + 0.5 * 80) * (5 + 28 + 5) / (5 + 14 + 5)), "pieces are whole runs"
+    resumed = TimeLeft({"frames": 40.0, "proxy": 56.0, "tracking": 10.0}, ("frames", "proxy", "tracking"))
     assert resumed.left() == 0
     resumed.begin("proxy")
-    assert resumed.left() == pytest.approx(2 * (33 + 5)), "what is made again does not count as done"
+    assert resumed.left() == pytest.approx(2 * (28 + 5)), "what is made again does not count as done"
+    draft = TimeLeft({"frames": 38.0}, STAGES, is_draft=True)
+    draft.begin("proxy")
+    assert draft.left() == pytest.approx(62.5)
 
 
 def test_words_for_a_time() -> None:
@@ -79,7 +86,7 @@ def test_bars_name_their_stage_and_close_at_their_count(monkeypatch: pytest.Monk
     assert "2 to 8 min to the end" in said, "one stage has ended: a guess"
     assert "[2/6 depth and classes] camera model" in said
     assert "100%" in last[-1]
-    assert "[2/6 depth and classes] done in 96 s; about 4 min left" in said
+    assert "[2/6 depth and classes] done in 96 s; 3 to 5 min left" in said
     assert "[2/6 depth and classes] up to date" in said
 
 
@@ -90,7 +97,7 @@ def test_lines_are_a_stage_each(capsys: pytest.CaptureFixture[str], monkeypatch:
     lines.stage(event(BEGUN))
     assert list(lines.track(range(3), "depth", 3)) == [0, 1, 2]
     lines.stage(event(ENDED))
-    assert capsys.readouterr().err == "room: [2/6 depth and classes] done in 96 s; about 4 min left\n"
+    assert capsys.readouterr().err == "room: [2/6 depth and classes] done in 96 s; 3 to 5 min left\n"
     lines.stage(event(BEGUN))
     for _ in lines.track(range(3), "depth", 3):
         now[0] += 400
