@@ -142,5 +142,5 @@ class TimeLeft:
 
 
 def in_pieces(figures: Mapping[str, Any]) -> float:
-    """How many frames the figures of `tracking` say to be in other pieces, for each of the main one's."""
+    """Count the frames that the figures of `tracking` say to be in other pieces, for each of the main one's."""
     return sum(figures.get("pieces", ())) / max(figures.get("posed", 0), 1)

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from ..system.jit import kernel
 
+_bare = kernel(_nrt=False)
+"""Compiles what makes no arrays, at half of the time."""
 MIN_DEPTH = 1e-6
 """Cheirality threshold in world units; observations below it get zero weight."""
 
@@ -30,7 +32,7 @@ def _offset(motion, point, camera, xy, inverse_sd):  # type: ignore[no-untyped-d
     return x, y, z, right, down
 
 
-@kernel
+@_bare
 def _residual(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, residual, jac_cam, jac_point):  # type: ignore[no-untyped-def]
     """Fill residual (3,), its derivatives by twist (3, 6) and point (3, 3); False if behind the camera."""
     x, y, z, residual[0], residual[1] = _offset(motion, point, camera, xy, inverse_sd)
@@ -55,7 +57,6 @@ def _residual(motion, point, camera, xy, inverse_sd, log_depth, depth_weight, re
     return True
 
 
-@kernel
 def _scratch():  # type: ignore[no-untyped-def]
     """Make a row for `_observe`: residual (3,), its derivatives by the twist (3, 6), the point (3, 3) and the twist of
     the camera it was followed from (3, 6), weights (3,); then, of that camera's own residual, the point's and it."""
@@ -89,19 +90,19 @@ def _observe(o, motions, points, data, row):  # type: ignore[no-untyped-def]
     return True
 
 
-@kernel
+@_bare
 def _cauchy(squared, width):  # type: ignore[no-untyped-def]
     """Cauchy's loss of a squared residual."""
     return width * width * np.log1p(squared / (width * width))
 
 
-@kernel
+@_bare
 def _cauchy_weight(squared, width):  # type: ignore[no-untyped-def]
     """The weight that it gives."""
     return 1.0 / (1.0 + squared / (width * width))
 
 
-@kernel
+@_bare
 def total_cost(motions, points, data):  # type: ignore[no-untyped-def]
     """Robust cost of all observations; one behind its camera costs what a residual of ten widths does."""
     camera, obs_cam, obs_point, source, xy, inverse_sd, log_depth, depth_weight, width = data
@@ -135,7 +136,7 @@ def _weighted(o, motions, points, data, row):  # type: ignore[no-untyped-def]
             weight[2] = _cauchy_weight(residual[2] ** 2, width)
 
 
-@kernel
+@_bare
 def _add_product(weight, left, right, block):  # type: ignore[no-untyped-def]
     """Add left^T W right to a block, of derivatives (3, n) and (3, m)."""
     n, m = block.shape
@@ -145,7 +146,7 @@ def _add_product(weight, left, right, block):  # type: ignore[no-untyped-def]
             block[i, j] += a * right[0, j] + b * right[1, j] + c * right[2, j]
 
 
-@kernel
+@_bare
 def _subtract_gradient(weight, jacobian, residual, right):  # type: ignore[no-untyped-def]
     """Subtract J^T W r from a right side (n,)."""
     a, b, c = weight[0] * residual[0], weight[1] * residual[1], weight[2] * residual[2]
@@ -153,14 +154,19 @@ def _subtract_gradient(weight, jacobian, residual, right):  # type: ignore[no-un
         right[i] -= a * jacobian[0, i] + b * jacobian[1, i] + c * jacobian[2, i]
 
 
-@kernel
 def linearise(motions, points, data):  # type: ignore[no-untyped-def]
     """Normal equations: camera blocks (N, 6, 6), (N, 6), point blocks (P, 3, 3), (P, 3). What mixes two of them is made
     again where it is needed: as many blocks as observations would be most of the memory."""
-    n, p, obs_cam, obs_point, source, row = len(motions), len(points), data[1], data[2], data[3], _scratch()
+    n, p = len(motions), len(points)
+    normal = np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros((p, 3, 3)), np.zeros((p, 3))
+    _linearise(motions, points, data, _scratch(), *normal)
+    return normal
+
+
+@_bare
+def _linearise(motions, points, data, row, cam_block, cam_right, point_block, point_right):  # type: ignore[no-untyped-def]
+    obs_cam, obs_point, source = data[1], data[2], data[3]
     residual, jac_cam, jac_point, jac_source, weight = row[0], row[1], row[2], row[3], row[4]
-    cam_block, cam_right = np.zeros((n, 6, 6)), np.zeros((n, 6))
-    point_block, point_right = np.zeros((p, 3, 3)), np.zeros((p, 3))
     for o in range(len(obs_cam)):
         c, q, s = obs_cam[o], obs_point[o], source[o]
         _weighted(o, motions, points, data, row)
@@ -171,41 +177,53 @@ def linearise(motions, points, data):  # type: ignore[no-untyped-def]
         if s >= 0:
             _add_product(weight, jac_source, jac_source, cam_block[obs_cam[s]])
             _subtract_gradient(weight, jac_source, residual, cam_right[obs_cam[s]])
-    return cam_block, cam_right, point_block, point_right
 
 
-@kernel
 def linearise_camera(motion, points, data):  # type: ignore[no-untyped-def]
     """Block (6, 6) and right side (6,) of one camera (1, 4, 4) among points that stay."""
-    row, block, right = _scratch(), np.zeros((6, 6)), np.zeros(6)
+    block, right = np.zeros((6, 6)), np.zeros(6)
+    _linearise_camera(motion, points, data, _scratch(), block, right)
+    return block, right
+
+
+@_bare
+def _linearise_camera(motion, points, data, row, block, right):  # type: ignore[no-untyped-def]
     for o in range(len(data[1])):
         _weighted(o, motion, points, data, row)
         _add_product(row[4], row[1], row[1], block)
         _subtract_gradient(row[4], row[1], row[0], right)
-    return block, right
 
 
-@kernel
 def displacement(motions, points, camera, obs_cam, obs_point, velocity, late):  # type: ignore[no-untyped-def]
     """(O, 2) pixels by which points move on in cameras of these velocities (N, 6) in `late` (O,) seconds."""
     out = np.zeros((len(obs_cam), 2))
-    residual, jac_cam, jac_point, nowhere = np.empty(3), np.empty((3, 6)), np.empty((3, 3)), np.zeros(2)
+    _displace(motions, points, camera, obs_cam, obs_point, velocity, late, _scratch(), np.zeros(2), out)
+    return out
+
+
+@_bare
+def _displace(motions, points, camera, obs_cam, obs_point, velocity, late, row, nowhere, out):  # type: ignore[no-untyped-def]
+    residual, jac_cam, jac_point = row[0], row[1], row[2]
     for o in range(len(obs_cam)):
         c = obs_cam[o]
         if _residual(motions[c], points[obs_point[o]], camera, nowhere, 1.0, 0.0, 0.0, residual, jac_cam, jac_point):
             for i in range(2):
                 for k in range(6):
                     out[o, i] += late[o] * jac_cam[i, k] * velocity[c, k]
-    return out
 
 
-@kernel
 def border(motions, points, data, moved):  # type: ignore[no-untyped-def]
     """Normal equations of one more unknown, of which a unit moves every observation by `moved` (O, 2) pixels: mixed
     with cameras (N, 6) and points (P, 3), its own, and its right side. None of the observations was followed."""
-    obs_cam, obs_point, inverse_sd, width, row = data[1], data[2], data[5], data[8], _scratch()
-    residual, jac_cam, jac_point = row[0], row[1], row[2]
     cams, on_points = np.zeros((len(motions), 6)), np.zeros((len(points), 3))
+    own, right = _add_border(motions, points, data, moved, _scratch(), cams, on_points)
+    return cams, on_points, own, right
+
+
+@_bare
+def _add_border(motions, points, data, moved, row, cams, on_points):  # type: ignore[no-untyped-def]
+    obs_cam, obs_point, inverse_sd, width = data[1], data[2], data[5], data[8]
+    residual, jac_cam, jac_point = row[0], row[1], row[2]
     own, right = 0.0, 0.0
     for o in range(len(obs_cam)):
         c, q = obs_cam[o], obs_point[o]
@@ -220,7 +238,7 @@ def border(motions, points, data, moved):  # type: ignore[no-untyped-def]
                 cams[c, k] += weight * step * jac_cam[i, k]
             for k in range(3):
                 on_points[q, k] += weight * step * jac_point[i, k]
-    return cams, on_points, own, right
+    return own, right
 
 
 @kernel
@@ -281,7 +299,7 @@ def _list_partners(a, order, place, ends, obs_cam, seen, columns, used):  # type
     return place, used
 
 
-@kernel
+@_bare
 def _block_of(a, b, rows, columns):  # type: ignore[no-untyped-def]
     """Number of the block of cameras a <= b."""
     number = rows[a]
@@ -290,7 +308,6 @@ def _block_of(a, b, rows, columns):  # type: ignore[no-untyped-def]
     return number
 
 
-@kernel
 def eliminate_points(  # type: ignore[no-untyped-def]
     motions, points, data, starts, inverse_block, point_right, rows, columns, blocks, right
 ):  # fmt: skip
@@ -300,12 +317,19 @@ def eliminate_points(  # type: ignore[no-untyped-def]
     Observations are sorted by point, then camera; starts (P + 1,) are their ranges; `rows` and `columns` as of
     `number_blocks`.
     """
-    obs_cam, source, row = data[1], data[3], _scratch()
+    mixed = np.empty((int(np.diff(starts).max(initial=0)), 6, 3))
+    _eliminate(
+        motions, points, data, starts, inverse_block, point_right, rows, columns, blocks, right, _scratch(),
+        np.empty((6, 3)), mixed,
+    )  # fmt: skip
+
+
+@_bare
+def _eliminate(  # type: ignore[no-untyped-def]
+    motions, points, data, starts, inverse_block, point_right, rows, columns, blocks, right, row, left, mixed
+):  # fmt: skip
+    obs_cam, source = data[1], data[3]
     jac_cam, jac_point, jac_source, weight = row[1], row[2], row[3], row[4]
-    most = 0
-    for q in range(len(starts) - 1):
-        most = max(most, starts[q + 1] - starts[q])
-    left, mixed = np.empty((6, 3)), np.empty((most, 6, 3))
     for q in range(len(starts) - 1):
         first, count = starts[q], starts[q + 1] - starts[q]
         mixed[:count] = 0.0
@@ -346,13 +370,18 @@ def eliminate_points(  # type: ignore[no-untyped-def]
                             block[j, i] -= share
 
 
-@kernel
 def point_steps(motions, points, data, inverse_block, point_right, cam_step):  # type: ignore[no-untyped-def]
     """Back substitution: steps (P, 3) of the points for the cameras' steps (N, 6)."""
-    obs_cam, obs_point, source, row = data[1], data[2], data[3], _scratch()
+    rest, out = point_right.copy(), np.zeros_like(point_right)
+    _step_points(motions, points, data, inverse_block, cam_step, _scratch(), rest, out)
+    return out
+
+
+@_bare
+def _step_points(motions, points, data, inverse_block, cam_step, row, rest, out):  # type: ignore[no-untyped-def]
+    obs_cam, obs_point, source = data[1], data[2], data[3]
     jac_cam, jac_point, jac_source, weight = row[1], row[2], row[3], row[4]
     moved = row[0]  # by the cameras' steps, instead of the residual
-    rest = point_right.copy()
     for o in range(len(obs_cam)):
         c, q, s = obs_cam[o], obs_point[o], source[o]
         _weighted(o, motions, points, data, row)
@@ -363,9 +392,7 @@ def point_steps(motions, points, data, inverse_block, point_right, cam_step):  #
                 if s >= 0:
                     moved[k] += jac_source[k, i] * cam_step[obs_cam[s], i]
         _subtract_gradient(weight, jac_point, moved, rest[q])
-    out = np.zeros_like(rest)
     for q in range(len(rest)):
         for i in range(3):
             for j in range(3):
                 out[q, i] += inverse_block[q, i, j] * rest[q, j]
-    return out

@@ -26,7 +26,8 @@ def kernel(function: F | None = None, **options: Any) -> Any:
 
     Floats are taken literally: none of numba's fastmath, for reordered sums have been seen to break equal bytes over
     thread counts; a division by zero gives an infinity or NaN, as in numpy. `options` are numba's, for example
-    parallel=True. Used as @kernel or @kernel(parallel=True).
+    parallel=True. Used as @kernel or @kernel(parallel=True). With _nrt=False a kernel can make no arrays, and does not
+    count who holds those that it is given and their parts: loops over short parts take half of the time.
     """
     if function is None:
         return functools.partial(kernel, **options)

@@ -1,5 +1,6 @@
 """Compiled CPU kernels and the pool of threads that runs them without the GIL."""
 
+import functools
 import itertools
 import os
 from collections.abc import Callable
@@ -116,10 +117,13 @@ def as_array(tensor: Tensor) -> NDArray[np.float32]:
     return array
 
 
-def inner(function: Callable[..., Any]) -> Callable[..., Any]:
+def inner(function: Callable[..., Any] | None = None, makes_arrays: bool = True) -> Callable[..., Any]:
     """Compile a function that only kernels call: it becomes part of them, so it needs no way in from Python and no
-    place in the cache, which would take a third of the time of compiling it."""
-    called: Callable[..., Any] = register_jitable(no_cpython_wrapper=True, **_OPTIONS)(function)
+    place in the cache, which would take a third of the time of compiling it. One that `makes_arrays` counts who holds
+    which, in each call."""
+    if function is None:
+        return functools.partial(inner, makes_arrays=makes_arrays)
+    called: Callable[..., Any] = register_jitable(no_cpython_wrapper=True, _nrt=makes_arrays, **_OPTIONS)(function)
     return called
 
 

@@ -130,7 +130,7 @@ def _sweep_band(
         _turn(block, length, last - first, width, places[:, start // BLOCK], strides, cost)
 
 
-@inner
+@inner(makes_arrays=False)
 def _turn(
     block: NDArray[np.float32],
     length: int,

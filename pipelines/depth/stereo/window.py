@@ -92,7 +92,7 @@ def weigh_windows(
     return weights, moments
 
 
-@inner
+@inner(makes_arrays=False)
 def need_around(tiles: NDArray[np.bool_], needed: NDArray[np.bool_]) -> bool:
     """Which vectors of a row are to be sampled, so that the windows of those `tiles` are whole; whether any is."""
     needed[:] = False
@@ -102,7 +102,7 @@ def need_around(tiles: NDArray[np.bool_], needed: NDArray[np.bool_]) -> bool:
     return bool(needed.any())
 
 
-@inner
+@inner(makes_arrays=False)
 def warp_row(
     other: NDArray[np.float32],
     columns: int,
@@ -145,7 +145,7 @@ def warp_row(
         store(samples, at + x, interpolate(other, columns, across, down))
 
 
-@inner
+@inner(makes_arrays=False)
 def correlate(
     samples: NDArray[np.float32],
     seen: NDArray[np.float32],
@@ -175,7 +175,7 @@ def correlate(
     return choose(known, value, splat(_OUTSIDE))
 
 
-@inner
+@inner(makes_arrays=False)
 def best_mean(
     samples: NDArray[np.float32],
     seen: NDArray[np.float32],
