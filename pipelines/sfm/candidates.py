@@ -21,7 +21,7 @@ from ..geometry.camera import ONE_CAMERA
 from ..system.parallel import LruSequence
 from ..system.progress import Progress
 from ..types import Features
-from .adjust import CAUCHY_PX, LOSS_SD, adjust_model, bundle_adjust, filter_outliers
+from .adjust import adjust_model
 from .consistency import (
     MIN_BETTER,
     MIN_SELF_CALIBRATION_GAIN,
@@ -31,7 +31,6 @@ from .consistency import (
     unexplained,
 )
 from .given import posed_model
-from .joining import WIDE, merge_loop_points
 from .lens import FOCAL_GUESS, unknown_camera
 from .matching import VerifiedPair, write_database
 from .rolling import NO_READOUT, Readout, adjust_rolling, read_readout, straight_copy
@@ -224,30 +223,13 @@ class CandidateModels:
         return best
 
     def _remap_from_neighbours(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> _ScoredModel | None:
-        """Map from neighbours alone, among which little repeats, then close loops by pairs that nearly agree."""
+        """Map from neighbours alone, among which little repeats; tracking closes the loops."""
         total, reach = self._places(views.xy), self.config.overlap
         near = [p for p in pairs if abs(p.first % total - p.second % total) <= reach]
         straight = self._build_model(NEIGHBOURS, views, near, pairs)
         if straight is None or straight[2].contradicted:
             return straight
-        closed = self._close_loops(straight, views, pairs)
-        grown = self._register_remaining(closed, views, pairs, near)
-        return closed if grown is closed else self._close_loops(grown, views, pairs)
-
-    def _close_loops(self, found: _ScoredModel, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> _ScoredModel:
-        """Merge points by matched pairs that nearly agree and adjust, as long as the score grows."""
-        while True:
-            model = pycolmap.Reconstruction(found[0])
-            if not merge_loop_points(model, pairs, (), views.xy):
-                return found
-            images = sorted(model.reg_image_ids())
-            for width in (WIDE * LOSS_SD, CAUCHY_PX):
-                bundle_adjust(model, images, refine_camera=False, width=width, roughly=True)
-            filter_outliers(model)
-            closed = self._judged(f"{NEIGHBOURS}-closed", model, views, pairs)
-            if closed[2].score <= found[2].score:
-                return found
-            found = closed
+        return self._register_remaining(straight, views, pairs, near)
 
     def _register_remaining(
         self, found: _ScoredModel, views: KeyframeSet, every: Sequence[VerifiedPair], known: Sequence[VerifiedPair]

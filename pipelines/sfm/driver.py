@@ -189,7 +189,7 @@ class StructureFromMotion(CandidateModels):
         camera = whole.model.cameras[1]
         del surest, found  # not beside the model of all
         release_free_memory()
-        together = partial(adjust_joined, pairs=pairs, windows=windows, narrowly=bool(views.weak))
+        together = partial(adjust_joined, narrowly=bool(views.weak))
         readout = together(whole.model, views.xy, views.times, readout, find_readout=given is None)
         others = made.others(camera, views.xy, whole.model, LEAST_PIECE)
         for other in others:

@@ -1,11 +1,11 @@
-"""Parts of a path become one: windows of a long recording, and the ends of a loop.
+"""Windows of a long recording become one; loops between them are closed in tracking, by their links.
 
 A mapper's memory grows by half a megabyte to two a keyframe, nearly all of it in its adjustments, so that no more than
 one window is in work at any time. What is joined is adjusted by `pipelines.sfm.bundle`, which needs a tenth.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,7 +19,6 @@ from .adjust import LOSS_SD, filter_outliers, median_error
 from .bundle import adjust_bundle
 from .components import remove_keyframes
 from .given import bare_model
-from .matching import VerifiedPair
 from .rolling import MIN_GAIN, NO_READOUT, Readout, RollingModel, estimate
 
 _SUREST_PX = 1e-3
@@ -28,13 +27,8 @@ _SUREST_PX = 1e-3
 Array = NDArray[np.float64]
 
 _MIN_SHARED = 30
-_MIN_MATCHES, _NEAR, _OUTLIER = 12, 0.05, 3.0
-"""A loop between windows: its least matches, their median error as a share of the image's longer side, from
-where it is left to `global_ba`, and how many medians a match may be off. On made-up walks only."""
 _READOUT_ROUNDS = 3
 """Each step falls a little short."""
-WIDE = 40.0
-"""Of the loss of the adjustment that pulls loops together: standard deviations."""
 
 
 @dataclass
@@ -100,47 +94,13 @@ def align_views(source: Array, target: Array, source_points: Array, target_point
     return Similarity(scale, rotation, np.median(wanted - scale * centers @ rotation.T, axis=0))
 
 
-def merge_loop_points(
-    model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair], windows: Sequence[range], xy: Sequence[Array]
-) -> int:  # fmt: skip
-    """Make one of points that verified matches between windows say are one, where the windows nearly agree, in
-    place; how many."""
-    camera, merged = model.cameras[1], 0
-    for pair in pairs:
-        if any(pair.first in w and pair.second in w for w in windows):
-            continue
-        if not all(model.exists_image(k + 1) for k in (pair.first, pair.second)):
-            continue
-        first, second = (model.images[k + 1] for k in (pair.first, pair.second))
-        rows = [(int(a), int(b)) for a, b in pair.matches
-                if first.points2D[int(a)].has_point3D() and second.points2D[int(b)].has_point3D()]  # fmt: skip
-        ids = [(first.points2D[a].point3D_id, second.points2D[b].point3D_id) for a, b in rows]
-        if len(rows) < _MIN_MATCHES:
-            continue
-        points = np.array([model.points3D[p].xyz for p, _ in ids])
-        pose = pose_of(second)
-        seen = points @ pose[:3, :3].T + pose[:3, 3]
-        error = np.linalg.norm(np.asarray(camera.img_from_cam(seen)) - xy[pair.second][[b for _, b in rows]], axis=1)
-        error = np.where((seen[:, 2] > 0) & np.isfinite(error), error, np.inf)
-        if not (middle := float(np.median(error))) <= _NEAR * max(camera.width, camera.height):
-            continue
-        for (p, q), off in zip(ids, error, strict=True):
-            if p != q and off <= _OUTLIER * middle and model.exists_point3D(p) and model.exists_point3D(q):
-                model.merge_points3D(p, q)
-                merged += 1
-    return merged
-
-
 def adjust_joined(
-    model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout, pairs: Iterable[VerifiedPair],
-    windows: Sequence[range], narrowly: bool, find_readout: bool = False,
+    model: pycolmap.Reconstruction, xy: Sequence[Array], times: Array, readout: Readout, narrowly: bool,
+    find_readout: bool = False,
 ) -> Readout:  # fmt: skip
-    """Adjust the joined windows as one, with the loops between them, in place; `narrowly` as of `adjust`. Returns the
-    readout: that given, or with `find_readout` what all keyframes together tell."""
+    """Adjust the joined windows as one, in place; `narrowly` as of `adjust`. Returns the readout: that given, or with
+    `find_readout` what all keyframes together tell."""
     adjust_together(model, xy, times, readout)
-    if merge_loop_points(model, pairs, windows, xy):
-        adjust_together(model, xy, times, readout, WIDE)
-        adjust_together(model, xy, times, readout)
     if find_readout and any(readout):
         readout = found_readout(model, xy, times, readout)
     if narrowly:

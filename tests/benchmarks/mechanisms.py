@@ -72,7 +72,6 @@ MECHANISMS = {
     "unfolding": Mechanism(
         candidates.CandidateModels, "_remap_from_neighbours", lambda *_: None, lambda found, _: found is not None
     ),
-    "closing": Mechanism(candidates.CandidateModels, "_close_loops", _same(1), lambda out, a: out is not a[1]),
     "growing": Mechanism(candidates.CandidateModels, "_register_remaining", _same(1), lambda out, a: out is not a[1]),
     "readout": Mechanism(candidates, "adjust_rolling", lambda *_: None, lambda out, _: out is not None),
     "freeing": Mechanism(

@@ -96,7 +96,7 @@ def test_sides_that_look_alike_do_not_fold_the_path(tmp_path: Path, monkeypatch:
     assert folded[2].contradicted
     assert tracks == [150, 300]  # of a view: a chain of neighbours drifts by 3 m on 150 in a corridor, not in this room
     model, mapper, report = found
-    assert mapper == "neighbours-closed"
+    assert mapper == "neighbours"
     assert not report.contradicted
     assert model.num_reg_images() == VIEWS
     placed = np.array([model.images[i + 1].projection_center() for i in range(VIEWS)])

@@ -19,14 +19,8 @@ from msgs_slam.pipelines.run.manifest import Manifest, Source, write_manifest
 from msgs_slam.pipelines.run.reads import Reads, StageRecord
 from msgs_slam.pipelines.run.settings import load_config
 from msgs_slam.pipelines.sfm.adjust import adjust_model, model_errors
-from msgs_slam.pipelines.sfm.joining import (
-    WIDE,
-    Joined,
-    adjust_together,
-    merge_loop_points,
-)
+from msgs_slam.pipelines.sfm.joining import Joined, adjust_together
 from msgs_slam.pipelines.sfm.lens import unknown_camera
-from msgs_slam.pipelines.sfm.matching import VerifiedPair
 from msgs_slam.pipelines.sfm.rolling import NO_READOUT
 from msgs_slam.pipelines.system.machine import WINDOW, WINDOW_OVERLAP, window_size, windows_of
 from msgs_slam.pipelines.types import Calibration, Intrinsics
@@ -124,43 +118,6 @@ def test_windows_of_three_worlds_become_one_model() -> None:
     assert sorted(whole.reg_image_ids()) == list(range(1, COUNT + 1))
     assert off_by(whole).max() < 0.01
     assert float(np.median(model_errors(whole))) == pytest.approx(0.55, abs=0.1)
-
-
-def drifted() -> tuple[pycolmap.Reconstruction, list[Array]]:
-    """The walk and all its views once more in the other direction, where the second half has drifted by two per cent:
-    its points are others."""
-    model, xy = model_of(range(COUNT), moves()[0], 0.0)
-    again, _ = model_of(range(COUNT), Similarity(1.02, np.eye(3), np.array([0.05, 0.03, 0.0])), 0.0)
-    for k in range(COUNT):
-        image = again.images[k + 1]
-        pixels = pycolmap.Point2DList([pycolmap.Point2D(at) for at in xy[k]])
-        new = pycolmap.Image(name=str(COUNT + k + 1), points2D=pixels, camera_id=1, image_id=COUNT + k + 1)
-        model.add_image_with_trivial_frame(new, image.cam_from_world())
-    for point in again.points3D.values():
-        track = [pycolmap.TrackElement(COUNT + e.image_id, e.point2D_idx) for e in point.track.elements]
-        model.add_point3D(point.xyz, pycolmap.Track(track), np.zeros(3, np.uint8))
-    return model, xy + xy
-
-
-def test_a_loop_between_windows_is_closed() -> None:
-    """Nothing but the matches holds the two walks together."""
-    model, xy = drifted()
-    matches = [np.repeat(np.arange(len(xy[k]), dtype=np.uint32)[:, None], 2, 1) for k in range(COUNT)]
-    pairs = [VerifiedPair(k, COUNT + k, matches[k], 2, np.zeros((3, 3, 3))) for k in range(0, COUNT, 4)]
-    apart = lambda: max(  # noqa: E731
-        np.linalg.norm(model.images[k].projection_center() - model.images[COUNT + k].projection_center())
-        for k in range(1, COUNT + 1)
-    )
-    assert apart() > 0.1
-    points = model.num_points3D()
-    merged = merge_loop_points(model, pairs, [range(COUNT), range(COUNT, 2 * COUNT)], xy)
-    assert merged > 300
-    assert model.num_points3D() == points - merged
-    times = np.arange(2 * COUNT) / 10
-    adjust_together(model, xy, times, NO_READOUT, WIDE)
-    adjust_together(model, xy, times, NO_READOUT)
-    assert apart() < 0.005
-    assert merge_loop_points(model, pairs, [range(2 * COUNT)], xy) == 0
 
 
 def test_windows_that_share_too_little_are_not_joined() -> None:
