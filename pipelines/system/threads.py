@@ -103,9 +103,11 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_pools)
 
 
-def fused_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile as `pipelines.system.jit.kernel` does, with fused sums."""
-    compiled: Callable[..., Any] = jit.kernel(function, **_OPTIONS)
+def fused_kernel(function: Callable[..., Any] | None = None, makes_arrays: bool = True) -> Callable[..., Any]:
+    """Compile as `pipelines.system.jit.kernel` does, with fused sums; see `inner`."""
+    if function is None:
+        return functools.partial(fused_kernel, makes_arrays=makes_arrays)
+    compiled: Callable[..., Any] = jit.kernel(function, _nrt=makes_arrays, **_OPTIONS)
     return compiled
 
 

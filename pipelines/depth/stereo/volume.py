@@ -86,7 +86,7 @@ class CostVolume(NamedTuple):
         return self._replace(values=np.zeros_like(self.values))
 
 
-@inner
+@inner(makes_arrays=False)
 def pixel_of_tile(y: int, x: int) -> int:
     """Return the number of a pixel in its tile."""
     return y % TILE * TILE + x % TILE
@@ -175,9 +175,12 @@ def smooth_cost(
         starts = path_starts(cost.height, cost.width, dy, dx)
 
         def work(first: int, last: int, dy: int = dy, dx: int = dx, starts: NDArray[np.int64] = starts) -> None:
+            planes = cost.places.shape[2] * BLOCK
+            # One cell of padding on both sides stands for "no such plane"; so do the planes of blocks a tile has not.
+            kept = np.empty((2, _ABREAST, planes + 2), np.float32), np.empty((2, _ABREAST), np.float32)
             _scan_paths(
                 cost.values, cost.places, cost.strides, image, starts[first:last], dy, dx, small, large, edge,
-                total.values,
+                total.values, *kept, np.empty(_ABREAST, np.int64),
             )  # fmt: skip
 
         bands.run(len(starts), work, 64)
@@ -193,7 +196,7 @@ def path_starts(height: int, width: int, dy: int, dx: int) -> NDArray[np.int64]:
     return np.argwhere(first)
 
 
-@fused_kernel
+@fused_kernel(makes_arrays=False)
 def _scan_paths(
     cost: NDArray[np.float32],
     places: NDArray[np.int64],
@@ -206,13 +209,15 @@ def _scan_paths(
     large: float,
     edge: float,
     total: NDArray[np.float32],
+    sums: NDArray[np.float32],
+    ends: NDArray[np.float32],
+    stale: NDArray[np.int64],
 ) -> None:
+    """Walk along the paths from their `starts`; sums (2, paths abreast, D + 2) before and now, ends (2, paths abreast)
+    the least of them and the intensity, and `stale` (paths abreast,) are what each of them keeps."""
     height, width = image.shape
-    planes, step, far = places.shape[2] * BLOCK, splat(np.float32(small)), splat(UNREACHED)
-    # One cell of padding on both sides stands for "no such plane"; so do the planes of blocks that a tile has not.
-    before, now = np.empty((_ABREAST, planes + 2), np.float32), np.empty((_ABREAST, planes + 2), np.float32)
-    lowest, intensity = np.empty(_ABREAST, np.float32), np.empty(_ABREAST, np.float32)
-    stale = np.empty(_ABREAST, np.int64)
+    step, far = splat(np.float32(small)), splat(UNREACHED)
+    before, now, lowest, intensity = sums[0], sums[1], ends[0], ends[1]
     for group in range(0, len(starts), _ABREAST):
         count, steps = min(_ABREAST, len(starts) - group), 0
         for s in range(count):
@@ -254,7 +259,7 @@ def _scan_paths(
             steps += 1
 
 
-@inner
+@inner(makes_arrays=False)
 def _begin(here: NDArray[np.int64], before: NDArray[np.float32]) -> None:
     """A path's first pixel has no way to it: 0 in the blocks of its tile."""
     before[:] = UNREACHED
