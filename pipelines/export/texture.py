@@ -157,7 +157,7 @@ def _sample(total, owner, top, corners, faces, in_cam, shows, photo, depth, trus
     rows, columns = owner.shape
     height, width = depth.shape
     fx, fy, cx, cy = camera
-    normal, last = np.zeros(3), -1
+    nx, ny, nz, last = 0.0, 0.0, 0.0, -1
     for row in range(rows):
         for column in range(columns):
             f = owner[row, column]
@@ -165,8 +165,11 @@ def _sample(total, owner, top, corners, faces, in_cam, shows, photo, depth, trus
                 continue
             a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
             if f != last:
-                normal, last = np.cross(in_cam[b] - in_cam[a], in_cam[c] - in_cam[a]), f
-                normal /= max(np.sqrt((normal**2).sum()), 1e-300)
+                ux, uy, uz = in_cam[b, 0] - in_cam[a, 0], in_cam[b, 1] - in_cam[a, 1], in_cam[b, 2] - in_cam[a, 2]
+                vx, vy, vz = in_cam[c, 0] - in_cam[a, 0], in_cam[c, 1] - in_cam[a, 1], in_cam[c, 2] - in_cam[a, 2]
+                nx, ny, nz, last = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx, f
+                size = max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-300)
+                nx, ny, nz = nx / size, ny / size, nz / size
             p, q, r = _shares(column + 0.5, row + top + 0.5, corners, a, b, c)
             x = p * in_cam[a, 0] + q * in_cam[b, 0] + r * in_cam[c, 0]
             y = p * in_cam[a, 1] + q * in_cam[b, 1] + r * in_cam[c, 1]
@@ -176,7 +179,7 @@ def _sample(total, owner, top, corners, faces, in_cam, shows, photo, depth, trus
             u, v = fx * x / z + cx, fy * y / z + cy
             if u < 0.5 or v < 0.5 or u >= width - 0.5 or v >= height - 0.5:
                 continue
-            along = abs(normal[0] * x + normal[1] * y + normal[2] * z) / np.sqrt(x * x + y * y + z * z)
+            along = abs(nx * x + ny * y + nz * z) / np.sqrt(x * x + y * y + z * z)
             if abs(depth[int(v), int(u)] - z) >= (same + 1 / (fx * max(along, 1e-3))) * z:
                 continue
             share = trust[int(v), int(u)] * (sharpness * fx * along / z) ** power

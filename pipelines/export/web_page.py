@@ -102,7 +102,7 @@ def pack_cloud(cloud: GaussianCloud, upright: NDArray[np.float64]) -> tuple[dict
     planes.append(np.full(len(cloud), VOID, np.uint8) if cloud.class_ids is None else cloud.class_ids)
     things = np.zeros(len(cloud), np.uint16) if cloud.things is None else cloud.things
     planes.append(np.where(things <= MAX_THINGS, things, 0))
-    packed = gzip.compress(np.stack(planes).astype(np.uint8).tobytes(), compresslevel=9, mtime=0)
+    packed = gzip.compress(np.stack(planes).astype(np.uint8).tobytes(), compresslevel=6, mtime=0)
     about = {
         "count": len(cloud), "total": total, "low": low.tolist(), "high": high.tolist(),
         "log_radii": [float(smallest), float(largest)], "middle": np.median(means, axis=0).tolist(),

@@ -36,24 +36,30 @@ def _draw(in_cam, faces, camera, face, shares, depth):  # type: ignore[no-untype
     height, width = face.shape
     fx, fy, cx, cy = camera
     for f in range(len(faces)):
-        a, b, c = in_cam[faces[f, 0]], in_cam[faces[f, 1]], in_cam[faces[f, 2]]
-        bc, ca, ab = np.cross(b, c), np.cross(c, a), np.cross(a, b)
-        volume = (a * bc).sum()
-        if volume == 0 or max(a[2], b[2], c[2]) <= 0:
-            continue
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ax, ay, az = in_cam[a, 0], in_cam[a, 1], in_cam[a, 2]
+        bx, by, bz = in_cam[b, 0], in_cam[b, 1], in_cam[b, 2]
+        gx, gy, gz = in_cam[c, 0], in_cam[c, 1], in_cam[c, 2]
         left, right, top, bottom = 0, width - 1, 0, height - 1
-        if min(a[2], b[2], c[2]) > 0:
-            u = np.array([fx * a[0] / a[2], fx * b[0] / b[2], fx * c[0] / c[2]]) + cx
-            v = np.array([fy * a[1] / a[2], fy * b[1] / b[2], fy * c[1] / c[2]]) + cy
-            left, right = max(left, int(max(u.min() - 1, 0))), min(right, int(min(max(u.max(), -1), width)))
-            top, bottom = max(top, int(max(v.min() - 1, 0))), min(bottom, int(min(max(v.max(), -1), height)))
+        if min(az, bz, gz) > 0:
+            u, v, w = fx * ax / az + cx, fx * bx / bz + cx, fx * gx / gz + cx
+            left, right = max(left, int(max(min(u, v, w) - 1, 0))), min(right, int(min(max(u, v, w, -1), width)))
+            u, v, w = fy * ay / az + cy, fy * by / bz + cy, fy * gy / gz + cy
+            top, bottom = max(top, int(max(min(u, v, w) - 1, 0))), min(bottom, int(min(max(u, v, w, -1), height)))
+        # Products of two corners each: written out, for arrays of three would take most of the time.
+        bcx, bcy, bcz = by * gz - bz * gy, bz * gx - bx * gz, bx * gy - by * gx
+        cax, cay, caz = gy * az - gz * ay, gz * ax - gx * az, gx * ay - gy * ax
+        abx, aby, abz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        volume = ax * bcx + ay * bcy + az * bcz
+        if volume == 0 or max(az, bz, gz) <= 0:
+            continue
         for row in range(top, bottom + 1):
             y = (row + 0.5 - cy) / fy
             for column in range(left, right + 1):
                 x = (column + 0.5 - cx) / fx
-                p = (bc[0] * x + bc[1] * y + bc[2]) / volume
-                q = (ca[0] * x + ca[1] * y + ca[2]) / volume
-                r = (ab[0] * x + ab[1] * y + ab[2]) / volume
+                p = (bcx * x + bcy * y + bcz) / volume
+                q = (cax * x + cay * y + caz) / volume
+                r = (abx * x + aby * y + abz) / volume
                 total = p + q + r
                 if total <= 0 or min(p, q, r) < 0:
                     continue
