@@ -298,7 +298,9 @@ def make_pieces(context: StageContext) -> list[RunFolder]:
         try:
             settings, inside = _settings(context.config), WithinStage(context.progress, name)
             work = StageContext(piece, context.source, settings, piece.root, inside, stages=stages)
-            run_stages(work, piece_digest(records, name))
+            tracked = run_stages(work, piece_digest(records, name))["tracking"].figures
+            if tracked["posed"] < tracked["frames"]:
+                context.warn(f"{name}: {tracked['posed']} of its {tracked['frames']} frames keep their pose alone")
         except RecoverableError:
             raise
         except InputError as error:

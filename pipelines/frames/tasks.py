@@ -16,7 +16,7 @@ from ..geometry.camera import Rig, rig_of
 from ..run.stages import Chunk, StageContext
 from ..sfm.candidates import GIVEN_ONLY
 from ..sfm.consistency import unexplained
-from ..sfm.driver import Divide, Structure, StructureFromMotion, no_prefetch
+from ..sfm.driver import Divide, Structure, StructureFromMotion
 from ..sfm.features import clear_of
 from ..sfm.lens import FOCAL_GUESS, to_pycolmap, unknown_camera
 from ..sfm.matching import VerifiedPair, match_features, match_pair
@@ -67,7 +67,7 @@ def structure_from_motion(
     rig: Rig,
     given: GivenPoses | None,
     has_times: bool,
-    divide: Divide = no_prefetch,
+    divide: Divide = lambda *_: None,
 ) -> StructureFromMotion:
     """Prepare structure from motion of these frames; `origin` is as in `known_camera`, `has_times` as of a source."""
     settings, size = context.config.frames, (camera.width, camera.height)
@@ -110,7 +110,6 @@ def structure_from_motion(
         window=window_size(context.config.run.memory_mb, camera.width * camera.height),
         cam_from_rig=rig.cam_from_rig,
         divide=divide,
-        warn=context.warn,
     )
 
 
@@ -232,8 +231,8 @@ def _without_prior(
         is_fixed=False,
         is_stated=False,
         extract=lambda i: motion.snapshots.value(features_name(i), lambda: motion.extract(i)),
+        divide=lambda *_: None,
         snapshots=snapshots,
-        divide=no_prefetch,
     )
     try:
         found = free.run(keyframes)

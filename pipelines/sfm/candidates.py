@@ -253,11 +253,8 @@ class CandidateModels:
     ) -> _ScoredModel | None:
         """A mapper's model of these pairs, judged by `every` one; one to `start` from is added to."""
         model = self.snapshots.model(name, lambda work: self._run_mapper(name, work, views, pairs, start))
-        return None if model is None else self._judged(name, model, views, every)
-
-    def _judged(
-        self, name: str, model: pycolmap.Reconstruction, views: KeyframeSet, every: Sequence[VerifiedPair]
-    ) -> _ScoredModel:
+        if model is None:
+            return None
         return model, name, judge(model, every, views.xy, self._places(views.xy), self.config.overlap)
 
     def _run_mapper(

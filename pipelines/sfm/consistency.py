@@ -121,22 +121,26 @@ def judge(
     total: int,
     reach: int,
     breaks: Container[int] = (),
+    straight: Sequence[Array] | None = None,
 ) -> ModelReport:
     """Report on a model; `pairs` are indices i of keyframes whose image id is i + 1, `xy` their features' pixels.
 
     total: number of stations; keyframes i, i + total and so on are views from one place in several
     directions, and the report is about places. `reach`: places at most so many apart are neighbours. `breaks`: places
-    before which the seam counts as without a point.
+    before which the seam counts as without a point. `straight`: pixels in frames taken at once, by which the drift of
+    each component is measured, and not that of all.
     """
     checks = check_pairs(model, pairs, xy, total)
     matches, agreeing = sum(c.matches for c in checks), sum(c.agreeing for c in checks)
     placed, tracks = sorted({(i - 1) % total for i in model.reg_image_ids()}), tracks_of(model, total)
     seams = [replace(s, points=0) if s.after in breaks else s for s in find_seams(placed, checks, tracks, reach)]
     components = find_components(placed, seams, tracks, reach)
+    parts, seen = ([placed], xy) if straight is None else (components, straight)
+    drifts = (scale_drift(model, pairs, seen, total, reach, part) for part in parts)
     return ModelReport(
         len(placed), total, model.num_points3D(), median_error(model),
         agreeing / max(matches, 1), sum(c.agrees for c in checks) / max(len(checks), 1),
-        tuple(seams), tuple(map(tuple, components)), scale_drift(model, pairs, xy, total, reach, placed),
+        tuple(seams), tuple(map(tuple, components)), max(drifts, key=lambda d: d.factor, default=NO_DRIFT),
     )  # fmt: skip
 
 

@@ -15,12 +15,11 @@ from ...formats.errors import InputError
 from ...formats.textfile import read_json, write_json
 from ..system.machine import WINDOW, release_free_memory, windows_of
 from ..system.parallel import LruSequence, parallel_map
-from ..system.progress import log
 from ..types import Features, Vocabulary
 from .adjust import adjust_model
 from .candidates import GIVEN_ONLY, AdjustedModel, CandidateModels, KeyframeSet, pairs_within
 from .components import cut, remove_keyframes, undetermined_cameras
-from .consistency import MAX_DRIFT, NO_DRIFT, ModelReport, judge, scale_drift
+from .consistency import MAX_DRIFT, ModelReport, judge
 from .features import (
     GlobalDescriptors,
     compute_global_descriptors,
@@ -45,10 +44,6 @@ _PAIRS_PER_BLOCK = 64
 _FEATURES_SHARE = 0.25
 """Of the memory that there is: what has no room there is read again from the snapshot."""
 Divide = Callable[[str, int, dict[str, NDArray]], None]
-
-
-def no_prefetch(name: str, count: int, known: dict[str, NDArray]) -> None:
-    """Nothing beforehand: what is not in the snapshots is made when it is asked for."""
 
 
 @dataclass(frozen=True)
@@ -88,9 +83,8 @@ class StructureFromMotion(CandidateModels):
     threads: int
     memory: float = math.inf
     window: int = WINDOW
-    divide: Divide = no_prefetch
+    divide: Divide = lambda *_: None
     given: NDArray[np.float64] | None = None
-    warn: Callable[[str], None] = log.warning
 
     def run(self, keyframe_ids: Sequence[int]) -> Structure:
         """Raises InputError when the keyframes have no parallax or too little in common."""
@@ -128,10 +122,8 @@ class StructureFromMotion(CandidateModels):
         loose, breaks, range_of = list[int](), set[int](), (self._places(views.xy), self.config.overlap)
         straight = rectified_features(model, views.xy, views.times, readout)
         while True:
-            report = judge(model, pairs, views.xy, *range_of, breaks)
+            report = judge(model, pairs, views.xy, *range_of, breaks, straight)
             cut(model, report.components, report.total)
-            drifts = (scale_drift(model, pairs, straight, *range_of, component) for component in report.components)
-            report = replace(report, drift=max(drifts, key=lambda d: d.factor, default=NO_DRIFT))
             if report.drift.factor >= MAX_DRIFT and report.drift.at not in breaks:
                 breaks.add(report.drift.at)
                 continue
@@ -180,18 +172,15 @@ class StructureFromMotion(CandidateModels):
                 surest = found if surest is None or found.focal_sd < surest.focal_sd else surest
         if surest is None:
             return None, []
-        if complaint := made.complaint(len(windows)):
-            self.warn(complaint)
         camera, given = surest.model.cameras[1], read_readout(self.config.rolling_shutter)
         focal_sd = 0.0 if self.is_fixed else made.calibrate(camera)
         readout = made.readout() if given is None else given
         whole = replace(surest, model=made.largest().model(camera, views.xy), focal_sd=focal_sd)
-        camera = whole.model.cameras[1]
         del surest, found  # not beside the model of all
         release_free_memory()
         together = partial(adjust_joined, narrowly=bool(views.weak))
         readout = together(whole.model, views.xy, views.times, readout, find_readout=given is None)
-        others = made.others(camera, views.xy, whole.model, LEAST_PIECE)
+        others = made.others(whole.model.cameras[1], views.xy, whole.model, LEAST_PIECE)
         for other in others:
             together(other, views.xy, views.times, readout)
         return replace(whole, readout=readout), others

@@ -180,17 +180,6 @@ class WindowModels:
         first, second = np.average(self.readouts, axis=0, weights=self.observations).tolist()
         return first, second
 
-    def complaint(self, windows: int) -> str:
-        """Return a warning about what has not become one model, "" where everything has."""
-        failed = windows - len(self.cameras)
-        if len(self.components) == 1 and not failed:
-            return ""
-        return (
-            f"structure from motion of a long recording in {windows} windows: {failed} gave no model, and the others "
-            f"form {len(self.components)} disconnected components. The largest is the run, others become pieces. A "
-            "larger run.memory_mb makes windows larger, up to 500 keyframes"
-        )
-
     def largest(self) -> Joined:
         """Return the part with most keyframes, the first of equal ones."""
         return max(self.components, key=lambda component: len(component.poses))

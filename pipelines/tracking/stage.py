@@ -79,7 +79,8 @@ class TrackingStage:
         report = self._adjust(state)
         report = self._link(state) or report
         release_free_memory()
-        part_loose(state, report, pictures.intrinsics, LEAST_PIECE)
+        if not self.context.run.is_piece:  # of which the run around it has judged all
+            part_loose(state, report, pictures.intrinsics, LEAST_PIECE)
         carried = carry_given(self.context, state)
         self._require_poses(state, 2)
         state, *pieces = split_worlds(state, LEAST_PIECE)
