@@ -86,6 +86,13 @@ class Found:
         cloud = self._run.gaussians
         return cloud.only(self._among.of(cloud.means) == self.about.number)
 
+    def pictures(self, most: int = 8) -> list[tuple[str, NDArray[np.uint8], NDArray[np.bool_]]]:
+        """The keyframes that show most of it, cut out around it, largest first: file name of the frame, image
+        (h, w, 3), and mask (h, w) of its pixels. The first call for a run draws its mesh in all keyframes."""
+        from .pipelines.export.scene import pictures_of
+
+        return pictures_of(self._run._outcome, self._run._things_seen, self.about.number, most)
+
 
 class Run:
     """A run whose map is done, in the world of its exported files (z up and metres where `world.json` says so)."""
@@ -185,6 +192,13 @@ class Run:
         if (found := things_of_run(run, run.find(WORLD) or FIRST)) is None:
             raise InputError(f"{self.path} has no list of its things: make its export anew")
         return [Found(self, thing, found) for thing in found.table]
+
+    @cached_property
+    def _things_seen(self) -> dict[int, NDArray[np.uint16]]:
+        """(h, w) numbers of things in each keyframe, by its row."""
+        from .pipelines.export.scene import draw_things
+
+        return draw_things(self._outcome, self.mesh(), self.things[0]._among.numbers)
 
     def _label(self, name: str) -> int:
         if name not in self.classes:

@@ -20,6 +20,7 @@ from ..types import VOID, Array, ClassTable, Intrinsics
 
 Picture = NDArray[np.uint8]
 
+_LABELS_SHARE = 0.7
 _SEEN = 0.5
 """Less coverage than this is no surface: it has neither depth nor label."""
 
@@ -27,12 +28,13 @@ _SEEN = 0.5
 @dataclass(frozen=True)
 class MapView:
     """color (H, W, 3) float32 0..1; depth (H, W) float32, unit of the world, 0 = nothing; labels (H, W) uint8 or VOID;
-    coverage (H, W) float32 0..1."""
+    coverage and certainty (H, W) float32 0..1: how sure the class is, beside the surest in the view."""
 
     color: NDArray[np.float32]
     depth: NDArray[np.float32]
     labels: NDArray[np.uint8]
     coverage: NDArray[np.float32]
+    certainty: NDArray[np.float32]
 
     def exposed(self, exposure: Exposure | None, time: float) -> NDArray[np.uint8]:
         """(H, W, 3) image of the moment, with the exposure that the run found for it."""
@@ -57,11 +59,14 @@ def view_map(
     coverage = drawn.silhouette.cpu().numpy()
     solid = coverage >= _SEEN
     channels = decided_channels(drawn.features[..., 3:]).cpu().numpy()
+    probable = torch.softmax(drawn.features[..., 3:], -1).amax(-1) if len(label_of_channel) else drawn.silhouette
+    certainty = (probable / probable.max().clamp(min=1e-6)).cpu().numpy()
     return MapView(
         color=drawn.features[..., :3].clamp(0, 1).cpu().numpy().astype(np.float32),
         depth=np.where(solid, depth, 0).astype(np.float32),
         labels=labels_of_channels(np.where(solid, channels, -1), label_of_channel),
         coverage=coverage.astype(np.float32),
+        certainty=certainty.astype(np.float32),
     )
 
 
@@ -120,9 +125,13 @@ def label_picture(labels: NDArray[np.uint8], colors: Sequence[tuple[int, int, in
 
 
 def labels_on_photo(
-    photo: Picture, labels: NDArray[np.uint8], colors: Sequence[tuple[int, int, int]], share: float = 0.55
+    photo: Picture,
+    labels: NDArray[np.uint8],
+    colors: Sequence[tuple[int, int, int]],
+    certainty: NDArray[np.float32],
 ) -> Picture:
-    """(H, W, 3) the photo under its labels, with class borders drawn."""
+    """(H, W, 3) the photo under its labels, paler where these are less sure (H, W), with class borders drawn."""
+    share = (_LABELS_SHARE * certainty)[..., None]
     mixed = (1 - share) * photo + share * label_picture(labels, colors)
     edge = np.zeros(labels.shape, bool)
     edge[:, 1:] |= labels[:, 1:] != labels[:, :-1]

@@ -13,6 +13,7 @@ from ...formats.glb import ClassMesh, read_mesh_glb
 from ...formats.ply import MeshArrays, read_mesh_ply
 from ...formats.splats import GaussianCloud
 from ..config import ExportConfig
+from ..geometry.camera import resample_nearest
 from ..networks.registry import metric_card
 from ..run.files import MESH
 from ..run.folder import RunFolder
@@ -22,11 +23,14 @@ from ..run.target import Target
 from ..scene.gps import world_on_earth
 from ..scene.metres import find_metres
 from ..scene.world import FIRST, WORLD, World, find_upright, in_world, upright_world
+from ..system.raster import draw_faces
 from ..types import Metres
 from .holes import cut_light, cut_map, cut_mesh, holes_in
 from .inventory import NO_THINGS, THINGS, FoundThings, Selection, Thing, in_metres, load_things
 
 MESH_GLB = "mesh.glb"
+_DRAWN, _AROUND = 320, 12
+"""Pixels of the longer side at which a thing is looked for, and around it in its pictures."""
 _FREE = "The unit of lengths is free: one camera cannot measure metres. Metric depth or --scale-ref makes them metres."
 
 
@@ -179,6 +183,32 @@ def things_of_run(run: RunFolder, world: World) -> FoundThings | None:
     if own is None:
         return found
     return found.moved(world.exported_from_run @ own.exported_from_run.inverse())
+
+
+def draw_things(outcome: Outcome, mesh: MeshArrays, numbers: NDArray[np.uint16]) -> dict[int, NDArray[np.uint16]]:
+    """(h, w) numbers of the things, 0 for none, that each keyframe shows, by its row; of the vertices' numbers (V,) of
+    a mesh in the outcome's world."""
+    camera, t = outcome.calibration.intrinsics.at_most(_DRAWN), outcome.trajectory
+    a, b, c = numbers[mesh.faces].T
+    of_face = np.append(np.where((a == b) | (a == c), a, np.where(b == c, b, 0)), 0).astype(np.uint16)  # -1 is the last
+    rows = np.flatnonzero(t.is_keyframe & t.is_posed).tolist()
+    return {row: of_face[draw_faces(mesh.vertices, mesh.faces, t.cam_from_world[row], camera).face] for row in rows}
+
+
+def pictures_of(
+    outcome: Outcome, seen: dict[int, NDArray[np.uint16]], number: int, most: int
+) -> list[tuple[str, NDArray[np.uint8], NDArray[np.bool_]]]:
+    """Name, crop (h, w, 3) and mask (h, w) of the keyframes that show most of a thing, as `draw_things` saw them."""
+    pixels = {row: int((image == number).sum()) for row, image in seen.items()}
+    found = []
+    for row in sorted((row for row in seen if pixels[row]), key=lambda row: -pixels[row])[:most]:
+        frame = outcome.frames[row]
+        image = outcome.run.image(frame)
+        mask = resample_nearest(seen[row], *image.shape[:2]) == number
+        lines, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+        window = tuple(slice(max(at[0] - _AROUND, 0), at[-1] + _AROUND + 1) for at in (lines, columns))
+        found.append((frame.name, image[window], mask[window]))
+    return found
 
 
 def chosen_scene(scene: ExportScene, selection: Selection) -> ExportScene:

@@ -31,7 +31,7 @@ from .scene import ExportScene
 MAX_GAUSSIANS = 1_500_000
 """About 20 MB of page, what can be sent by mail; of larger maps the least visible are left out."""
 _MIN_BYTES = 10
-"""A Gaussian's in the page; 12 in the rooms measured."""
+"""A Gaussian's in the page; 13 in the rooms measured."""
 MAX_CAMERAS, MAX_THINGS = 120, 255
 EXPORTED, RUN = "exported", "run"
 """Worlds of a camera path: that of the exported files, and that of a run without an export."""
@@ -79,10 +79,10 @@ def page_of(
 
 
 def pack_cloud(cloud: GaussianCloud, upright: NDArray[np.float64]) -> tuple[dict[str, Any], bytes]:
-    """Pack a cloud for `cloud.js`: ranges for reading it, and 13 bytes per Gaussian, one plane per byte, gzipped.
+    """Pack a cloud for `cloud.js`: ranges for reading it, and 14 bytes per Gaussian, one plane per byte, gzipped.
 
     A position is 16 bits of a logarithm per axis, as a difference to the Gaussian before it in Morton order; radius,
-    opacity, colour, class and thing take 8 bits each. The same cloud gives the same bytes.
+    opacity, colour, class, thing and how sure the class is take 8 bits each. The same cloud gives the same bytes.
     """
     total, opacity = len(cloud), 1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))
     if total > MAX_GAUSSIANS:
@@ -102,6 +102,8 @@ def pack_cloud(cloud: GaussianCloud, upright: NDArray[np.float64]) -> tuple[dict
     planes.append(np.full(len(cloud), VOID, np.uint8) if cloud.class_ids is None else cloud.class_ids)
     things = np.zeros(len(cloud), np.uint16) if cloud.things is None else cloud.things
     planes.append(np.where(things <= MAX_THINGS, things, 0))
+    sure = np.ones(len(cloud)) if cloud.class_probs is None else cloud.class_probs.max(axis=1)
+    planes.append(np.round(255 * sure / max(sure.max(), 1e-9)))
     packed = gzip.compress(np.stack(planes).astype(np.uint8).tobytes(), compresslevel=6, mtime=0)
     about = {
         "count": len(cloud), "total": total, "low": low.tolist(), "high": high.tolist(),

@@ -118,7 +118,7 @@ def _settle(total: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.f
                     best = c
             if heard >= 1e-4:
                 labels[y, x] = best
-                confidence[y, x] = total[y, x, best] / heard * min(1.0, 2 * heard)
+                confidence[y, x] = total[y, x, best] / heard
     return labels, confidence
 
 

@@ -417,11 +417,15 @@ def scene_depth(views: Sequence[View]) -> float:
 
 def voted_logits(gaussian_map: GaussianMap, posed: Iterable[tuple[View, Tensor]]) -> Tensor:
     """(M, C) class logits by the labels of views, each with its pose (4, 4): a pixel gives its confidence to its class,
-    shared among the Gaussians as they are blended in it."""
+    shared among the Gaussians as they are blended in it; what it is unsure of is nobody's, so that the logits tell how
+    sure they are."""
     votes = torch.zeros_like(gaussian_map.class_logits)
+    total = votes.new_zeros(len(votes), 1)
     for view, pose in posed:
-        votes.index_add_(0, *class_weights(gaussian_map, pose, view.intrinsics, view.channels, view.label_weight))
-    total = votes.sum(1, keepdim=True)
+        seen = gaussian_map, pose, view.intrinsics, view.channels
+        votes.index_add_(0, *class_weights(*seen, view.label_weight))
+        rows, whole = class_weights(*seen, torch.ones_like(view.label_weight))
+        total.index_add_(0, rows, whole.sum(1, keepdim=True))
     # In place: a number for each class and Gaussian is a large table.
     votes.div_(total.clamp(min=_MIN_VOTES)).div_(_FLOOR).log1p_()
     unseen = total[:, 0] <= _MIN_VOTES

@@ -1,6 +1,7 @@
 """Learning of the network that names things by their shape (`pipelines/labels/shape.py`), from made rooms alone.
 
     python tests/benchmarks/names_by_shape.py make DIR --set learn --rooms 400     # 1.5 CPU seconds a room
+    python tests/benchmarks/names_by_shape.py make DIR --set wet --rooms 200       # kitchens and bathrooms
     python tests/benchmarks/names_by_shape.py learn DIR --steps 1700               # on one core, 0.2 s a step
     python tests/benchmarks/names_by_shape.py measure DIR --set judge              # IoU by class, of DIR/shape.npz
 
@@ -13,7 +14,7 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,9 +43,11 @@ from tests.benchmarks.rooms.light import LitRoom, _rays
 from tests.benchmarks.rooms.room import build_room
 from tests.benchmarks.rooms.surfaces import CLASSES
 from tests.benchmarks.rooms.textures import Random
+from tests.benchmarks.rooms.wet import WET
 
-SETS = {"learn": (50_100, 2000), "judge": (50_000, 40)}
-"""First seed and number of rooms."""
+SETS = {"learn": (50_100, 2000), "judge": (50_000, 40), "wet": (60_100, 1000), "judge-wet": (60_000, 20)}
+"""First seed and number of rooms; those from _WET on are kitchens and bathrooms in turn."""
+_WET = 60_000
 SIZE = 192, 144
 _POSES, _EVERY = 14, 3
 _BATCH, _RATE, _DECAY, _WARMED = 8, 3e-3, 1e-2, 0.04
@@ -72,7 +75,7 @@ class Views:
 
 def see_room(seed: int, catalogue: Catalogue) -> Views | None:
     """Walk through the room of a seed; None where there is no place to."""
-    room, r = build_room(seed, catalogue)
+    room, r = build_room(seed, catalogue, list(WET)[seed % 2] if seed >= _WET else "")
     unlit, mine = LitRoom(room.surfaces, lit=False), np.random.default_rng(seed + 77)
     walk = video._walk(room, unlit, r) if seed % 3 else None
     poses = clip._walk(room, unlit, clip.KEYFRAMES, r) if walk is None else None
@@ -164,14 +167,14 @@ def make(folder: Path, seeds: range) -> None:
 # learning -------------------------------------------------------------------------------------------------------
 
 
-def load(folder: Path, seeds: range) -> list[tuple[Array, NDArray[np.uint8]]]:
+def load(folder: Path, seeds: Iterable[int]) -> list[tuple[Array, NDArray[np.uint8]]]:
     """Channels and names of each keyframe of the rooms that are there."""
     paths = [p for s in seeds if (p := folder / "shapes" / f"{s}.npz").exists()]
     of_room = (load_arrays(path) for path in paths)
     return [pair for arrays in of_room for pair in zip(arrays["channels"], arrays["names"], strict=True)]
 
 
-def learn(folder: Path, seeds: range, steps: int, seconds: float, start: Path | None) -> None:
+def learn(folder: Path, seeds: list[int], steps: int, seconds: float, start: Path | None) -> None:
     """Learn for so many steps, from the weights of `start`, if given, by a third of the rate; stops after some seconds,
     and the next call goes on."""
     torch.manual_seed(0)
@@ -283,9 +286,10 @@ def main() -> None:
     cv2.setNumThreads(1)
     first, count = SETS[given.set]
     seeds = range(first, first + (given.rooms or count))
+    known = [seed for name in ("learn", "wet") for seed in range(SETS[name][0], sum(SETS[name]))]
     does: dict[str, Callable[[], None]] = {
         "make": lambda: make(given.folder, seeds),
-        "learn": lambda: learn(given.folder, seeds, given.steps, given.seconds, given.start),
+        "learn": lambda: learn(given.folder, known, given.steps, given.seconds, given.start),
         "measure": lambda: measure(given.folder, seeds),
     }
     (given.folder / "shapes").mkdir(parents=True, exist_ok=True)

@@ -25,7 +25,7 @@ async function unpackCloud(about, base64) {
     for (let c = 0; c < 4; c++) colors[4 * i + c] = bytes[(7 + c) * n + i];
   }
   const [shown, shownThings] = [0, 1].map(() => new Uint8Array(256).fill(1));
-  return { count: n, places, colors, classes: plane(11), things: plane(12), order: new Uint32Array(n), shown, shownThings };
+  return { count: n, places, colors, classes: plane(11), things: plane(12), sure: plane(13), order: new Uint32Array(n), shown, shownThings };
 }
 
 // Fills cloud.order far to near with what a camera can see and returns how many those are. The bits of a positive

@@ -11,7 +11,8 @@ void main() {
   ivec2 at = ivec2(int(index) % wide, int(index) / wide);
   vec4 ball = texelFetch(places, at, 0);
   color = texelFetch(colors, at, 0);
-  if (byClass) color.rgb = texelFetch(palette, ivec2(int(texelFetch(classes, at, 0).r * 255.0 + 0.5), 0), 0).rgb;
+  vec2 named = texelFetch(classes, at, 0).rg; // paler where it is unsure
+  if (byClass) color.rgb = mix(vec3(0.9), texelFetch(palette, ivec2(int(named.r * 255.0 + 0.5), 0), 0).rgb, named.g);
   vec4 cone = texelFetch(cones, at, 0);
   if (cone.xyz != vec3(0)) color.a *= smoothstep(cone.w - 0.35, cone.w, dot(normalize(cone.xyz), normalize(place - ball.xyz)));
   vec3 seen = turn * (ball.xyz - place);
@@ -62,7 +63,8 @@ function makePicture(canvas, cloud, classColors) {
   classColors.forEach((rgb, k) => palette.set(rgb, 4 * k));
   texture(0, "places", gl.RGBA32F, wide, high, gl.RGBA, gl.FLOAT, filled(cloud.places, 4));
   texture(1, "colors", gl.RGBA8, wide, high, gl.RGBA, gl.UNSIGNED_BYTE, filled(cloud.colors, 4));
-  texture(2, "classes", gl.R8, wide, high, gl.RED, gl.UNSIGNED_BYTE, filled(cloud.classes, 1));
+  const named = new Uint8Array(2 * cloud.count).map((_, i) => (i % 2 ? cloud.sure : cloud.classes)[i >> 1]);
+  texture(2, "classes", gl.RG8, wide, high, gl.RG, gl.UNSIGNED_BYTE, filled(named, 2));
   texture(3, "palette", gl.RGBA8, 256, 1, gl.RGBA, gl.UNSIGNED_BYTE, palette);
   texture(4, "cones", gl.RGBA8_SNORM, wide, high, gl.RGBA, gl.BYTE, filled(cloud.cones, 4));
 

@@ -15,6 +15,9 @@ SIZES = {
     "sofa": ((1, 2.6), (0.7, 0.95), (0.8, 1)), "radiator": ((0.6, 1.6), (0.5, 0.9), (0.1, 0.16)),
     "rail": ((1, 2.5), (0.9, 1.1), (0.06, 0.06)), "curtain": ((0.5, 1.5), (2, 2.4), (0.1, 0.1)),
     "box": ((0.2, 0.9), (0.15, 1.0), (0.2, 0.9)), "lamp": ((0.25, 0.45), (1.2, 1.7), (0.25, 0.45)),
+    "bath": ((1.5, 1.8), (0.5, 0.65), (0.7, 0.85)), "toilet": ((0.36, 0.42), (0.7, 0.85), (0.55, 0.7)),
+    "sink": ((0.45, 0.9), (0.8, 0.9), (0.4, 0.52)), "shower": ((0.75, 1.1), (1.9, 2.1), (0.75, 1.0)),
+    "bidet": ((0.35, 0.4), (0.4, 0.42), (0.5, 0.6)), "hob": ((0.5, 0.6), (0.02, 0.03), (0.45, 0.5)),
 }  # fmt: skip
 """Least and most width, height and depth, metres."""
 
@@ -183,11 +186,99 @@ def _lamp(box: _Builder, style: Style, r: Random) -> None:
     box(0, h - shade, 0, w, h, d, box.surfaces.material((0.8, 0.75, 0.65), emission=glow))
 
 
+def _cooker(box: _Builder, style: Style, r: Random) -> None:
+    (w, h, d), pane = style.size, r.uniform(0.5, 0.75)
+    box(0, 0, 0, w, h, d - 0.02, style.first)
+    box(0.005, 0.08, 0, w - 0.005, h - 0.005, d, style.second)
+    box(0.06, 0.15, d, w - 0.06, pane * h, d + 0.004, style.third)
+    box(0.08, (pane + 0.05) * h, d, w - 0.08, (pane + 0.05) * h + 0.02, d + 0.04, style.third)
+
+
+def _fridge(box: _Builder, style: Style, r: Random) -> None:
+    (w, h, d), cut = style.size, r.uniform(0.3, 0.7) * style.size[1]
+    box(0, 0, 0, w, h, d - 0.05, style.third)
+    for low, high in ((0.05, cut), (cut + 0.01, h)):
+        box(0, low, d - 0.05, w, high, d, style.third)
+        box(0.04, low + 0.1, d, 0.07, min(low + 0.5, high - 0.05), d + 0.03, style.second)
+
+
+def _basin(box: _Builder, style: Style, r: Random) -> None:
+    """A sink let into what is under the frame's foot, with its tap."""
+    w, d, t = style.size[0], style.size[2] * 0.9, 0.02
+    for a, b, c, e in ((0, 0, w, t), (0, d - t, w, d), (0, 0, t, d), (w - t, 0, w, d)):
+        box(a, -0.01, b, c, r.uniform(0.004, 0.015), e, style.third)
+    box(t, -0.01, t, w - t, 0.002, d - t, style.third)
+    box(w / 2 - 0.012, 0, -0.04, w / 2 + 0.012, 0.2, -0.016, style.third)
+    box(w / 2 - 0.012, 0.18, -0.04, w / 2 + 0.012, 0.2, 0.12, style.third)
+
+
+def _sink(box: _Builder, style: Style, r: Random) -> None:
+    (w, h, d), bowl = style.size, r.uniform(0.12, 0.2)
+    for a, b, c, e in ((0, 0, w, 0.06), (0, d - 0.04, w, d), (0, 0, 0.04, d), (w - 0.04, 0, w, d)):
+        box(a, h - bowl, b, c, h, e, style.third)
+    box(0, h - bowl, 0, w, h - bowl + 0.03, d, style.third)
+    box(w / 2 - 0.012, h, 0.02, w / 2 + 0.012, h + 0.15, 0.04, style.third)
+    box(w / 2 - 0.012, h + 0.13, 0.02, w / 2 + 0.012, h + 0.15, 0.15, style.third)
+    if r.random() < 0.5:
+        box(w / 2 - 0.09, 0, 0.05, w / 2 + 0.09, h - bowl, 0.25, style.third)
+    elif r.random() < 0.7:
+        box(0.02, 0.1, 0, w - 0.02, h - bowl, d - 0.03, style.first)
+
+
+def _bath(box: _Builder, style: Style, r: Random) -> None:
+    (w, h, d), rim = style.size, r.uniform(0.05, 0.1)
+    for a, b, c, e in ((0, 0, w, rim), (0, d - rim, w, d), (0, 0, rim, d), (w - rim, 0, w, d)):
+        box(a, 0, b, c, h, e, style.third)
+    box(rim, 0, rim, w - rim, r.uniform(0.1, 0.3), d - rim, style.third)
+
+
+def _toilet(box: _Builder, style: Style, r: Random) -> None:
+    (w, h, d), seat = style.size, 0.42
+    if r.random() < 0.7:
+        box(0, seat - 0.05, 0, w, h, 0.18, style.third)
+    box(0.08, 0, 0.1, w - 0.08, seat - 0.12, d - 0.12, style.third)
+    box(0.02, seat - 0.15, 0.12, w - 0.02, seat - 0.02, d, style.third)
+    box(0.01, seat - 0.02, 0.17, w - 0.01, seat, d + 0.01, style.third)
+    if r.random() < 0.4:
+        box(0.02, seat, 0.19, w - 0.02, seat + d * 0.7, 0.22, style.third)
+
+
+def _shower(box: _Builder, style: Style, r: Random) -> None:
+    (w, h, d), t = style.size, 0.03
+    box(0, 0, 0, w, r.uniform(0.03, 0.15), d, style.third)
+    for x in (0.0, w - t):
+        box(x, 0, d - t, x + t, h, d, style.second)
+    if r.random() < 0.6:
+        box(r.choice([0, w - 0.01]), 0.1, 0, w, h, d, style.second) if r.random() < 0.3 else None
+        box(0, h - t, d - t, w, h, d, style.second)
+    box(w / 2 - 0.015, 0.9, 0.02, w / 2 + 0.015, h, 0.05, style.second)
+    box(w / 2 - 0.1, h - 0.05, 0.02, w / 2 + 0.1, h - 0.02, 0.22, style.second)
+
+
+def _hood(box: _Builder, style: Style, r: Random) -> None:
+    w, h, d = style.size
+    box(0, 0.2, 0, w, 0.3, d + 0.1, style.third)
+    box(w / 2 - 0.15, 0.3, 0, w / 2 + 0.15, h, 0.25, style.third)
+
+
+def _hob(box: _Builder, style: Style, r: Random) -> None:
+    w, h, d = style.size
+    box(0, 0, 0, w, h * 0.3, d, style.second)
+    for x in (0.1, w - 0.26):
+        for z in (0.06, d - 0.22):
+            box(x, 0, z, x + 0.16, h, z + 0.16, style.third)
+
+
 _KINDS: dict[str, Callable[[_Builder, Style, Random], None]] = {
     "cupboard": _cupboard, "shelf": _shelf, "table": _table, "desk": _desk, "chair": _chair, "bed": _bed,
     "sofa": _sofa, "radiator": _radiator, "rail": _rail, "curtain": _curtain, "lamp": _lamp,
+    "cooker": _cooker, "fridge": _fridge, "basin": _basin, "sink": _sink, "bath": _bath, "toilet": _toilet,
+    "bidet": _toilet, "shower": _shower, "hood": _hood, "hob": _hob,
 }  # fmt: skip
 _CLASS_OF = {
     "cupboard": "storage", "shelf": "storage", "box": "storage", "table": "table", "desk": "table", "bed": "bed",
     "chair": "seating", "sofa": "seating", "radiator": "appliance", "curtain": "curtain", "lamp": "lamp",
+    **dict.fromkeys(
+        ("cooker", "fridge", "basin", "sink", "bath", "toilet", "bidet", "shower", "hood", "hob"), "appliance"
+    ),
 }  # fmt: skip

@@ -1,6 +1,7 @@
 """A room by seed: walls, openings, light and furniture, lit and ready to be photographed."""
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -9,7 +10,8 @@ import numpy as np
 from .furniture import Catalogue, Piece
 from .pieces import SIZES, Style, build_piece
 from .surfaces import UP, Array, Opening, Surfaces, Trim, Wall, build_wall, standing
-from .textures import WOODS, Random, carpet, color, linear, paper, pick, picture, wood
+from .textures import WOODS, Random, carpet, color, linear, paper, pick, picture, tiles, wood
+from .wet import WET, furnish_wet
 
 KINDS = {"home": 0.55, "office": 0.2, "class": 0.15, "bare": 0.1}
 
@@ -46,14 +48,19 @@ class Room:
         return beside and ((hole.kind == "door" and self.kind != "stairs") or self.is_outside(wall, hole))
 
 
-def build_room(seed: int, catalogue: Catalogue) -> tuple[Room, Random]:
-    """The room of a seed, and the source of chance for what follows."""
+def build_room(seed: int, catalogue: Catalogue, kind: str = "") -> tuple[Room, Random]:
+    """The room of a seed, and the source of chance for what follows; `kind` other than that of the seed: of WET."""
     r = np.random.default_rng(seed)
-    kind = _kind(r)
+    kind = kind or _kind(r)
     size = r.uniform(3, 6.5), r.uniform(3.2, 7.5), r.uniform(2.3, 3.2)
     if kind == "class":
         size = r.uniform(5.5, 9), r.uniform(6, 10), r.uniform(2.7, 3.6)
+    if kind in WET:
+        wide, deep = (float(r.uniform(*limits)) for limits in WET[kind])
+        size = wide, deep, size[2]
     room = Room(kind, size, Surfaces(), catalogue)
+    if kind in WET and r.random() < 0.6:
+        room.paint = room.surfaces.material((1, 1, 1), *tiles(r, color(r, "wall")))
     fill_room(room, r)
     return room, r
 
@@ -62,7 +69,7 @@ def fill_room(room: Room, r: Random) -> None:
     """Build its walls, light and furniture."""
     _build_shell(room, r)
     _hang_lights(room, r)
-    _Furnisher(room, r).furnish()
+    Furnisher(room, r).furnish()
 
 
 def kind_of(seed: int) -> str:
@@ -193,7 +200,7 @@ def _hang_lights(room: Room, r: Random) -> None:
             s.box((x + a / 2, high - drop, z + b / 2), (x + a / 2 + 0.01, high, z + b / 2 + 0.01), rim)
 
 
-class _Furnisher:
+class Furnisher:
     """Puts things where there is place."""
 
     def __init__(self, room: Room, r: Random) -> None:
@@ -215,16 +222,19 @@ class _Furnisher:
         r, room = self.r, self.room
         if room.kind == "class":
             self._rows_of_desks()
+        if room.kind in WET:
+            furnish_wet(self)
         kinds = ["cupboard", "cupboard", "shelf", "desk", "sofa", "bed", "radiator", "box", "curtain", "lamp"]
         narrow = room.kind in ("corridor", "stairs")
         if narrow:
             kinds = ["shelf", "radiator", "box", "lamp"]
-        for _ in range(int(r.integers(1, 6)) if room.kind == "bare" or narrow else int(r.integers(18, 45))):
+        few = room.kind in ("bare", *WET) or narrow
+        for _ in range(int(r.integers(1, 6)) if few else int(r.integers(18, 45))):
             if narrow or r.random() < 0.5 or not self.large:
                 self._against_wall(str(r.choice(kinds)))
             else:
                 self._against_wall(self.large[r.integers(len(self.large))])
-        if room.kind in ("home", "office"):
+        if room.kind in ("home", "office", "kitchen"):
             for _ in range(int(r.integers(4, 14))):
                 self._in_the_room()
         for frame, w, h, d in room.tops:
@@ -237,6 +247,10 @@ class _Furnisher:
             self._on_floor()
         if r.random() < 0.4:
             self._rug()
+
+    def named(self, words: str) -> list[Piece]:
+        """The pieces of the catalogue with such names."""
+        return [p for p in self.room.catalogue.pieces if re.search(words, p.name, re.IGNORECASE)]
 
     def style(self, kind: str) -> Style:
         """Size and materials by chance."""

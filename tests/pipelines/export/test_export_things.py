@@ -231,6 +231,35 @@ def test_python_gives_each_its_mesh_and_its_gaussians(run: RunFolder) -> None:
     assert len(chair.gaussians()) < len(msgs_slam.open_run(run.root).gaussians)
 
 
+def test_python_cuts_each_out_of_the_keyframes(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen from over the table, from under the floor, which hides all of it, and from near."""
+    opened = msgs_slam.open_run(run.root)
+    chair = next(t for t in opened.things if t.name == "chair 1")
+    outcome = opened._outcome
+    t, posed = outcome.trajectory, np.zeros_like(outcome.trajectory.is_keyframe)
+    poses, cameras = t.cam_from_world.copy(), ((1.0, 3.2, 1.2), (1.0, 3.2, -1.0), (2.9, 3.2, 0.8))
+    posed[: len(cameras)] = True
+    for row, eye in enumerate(cameras):
+        forward = np.array([3.25, 3.25, 0.45]) - eye
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, (0, 0, 1.0))
+        right /= np.linalg.norm(right)
+        poses[row, :3, :3] = (right, np.cross(forward, right), forward)
+        poses[row, :3, 3] = -poses[row, :3, :3] @ eye
+    moved = replace(outcome, trajectory=replace(t, cam_from_world=poses, is_keyframe=posed))
+    monkeypatch.setitem(vars(opened), "_outcome", moved)
+    shown = chair.pictures()
+    assert [name for name, _, _ in shown] == [outcome.frames[2].name, outcome.frames[0].name]
+    (_, image, near), (_, _, far) = shown
+    assert image.shape == (*near.shape, 3)
+    assert 1.2 < near.sum() / far.sum() < 50
+    rows, columns = np.nonzero(far)
+    assert rows.min() <= 12, "cut out around it"
+    assert columns.min() <= 12, "cut out around it"
+    assert 0.5 < far[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1].mean() <= 1
+    assert chair.pictures(1)[0][0] == shown[0][0]
+
+
 def test_a_lighter_mesh_has_a_node_for_each(run: RunFolder, tmp_path: Path) -> None:
     export_run(run, tmp_path, "mesh")
     mesh = read_mesh_glb(tmp_path / "mesh.glb")

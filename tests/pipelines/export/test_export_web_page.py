@@ -103,7 +103,7 @@ def test_a_large_map_keeps_what_is_seen_most(page: tuple[Path, Outcome], monkeyp
     cloud = map_cloud(page[1])
     about, packed = web_page.pack_cloud(cloud, np.eye(3))
     assert (about["count"], about["total"]) == (500, len(cloud))
-    assert len(gzip.decompress(packed)) == 13 * 500
+    assert len(gzip.decompress(packed)) == 14 * 500
     assert about["log_radii"][0] > np.median(cloud.log_scales)
 
 

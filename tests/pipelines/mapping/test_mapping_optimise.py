@@ -1,6 +1,7 @@
 """The map of the synthetic room: as good as it must be, the same bytes after an interruption, poses put right."""
 
 import gc
+import math
 import weakref
 from collections.abc import Iterator
 from dataclasses import replace
@@ -141,6 +142,9 @@ def test_a_gaussian_takes_the_classes_of_the_pixels_it_fills(room: MappingInput,
     assert 0.1 < changed.float().mean() < 1
     assert torch.allclose(logits[changed][:, 1], torch.tensor(SEED_LOGIT))
     assert logits[changed][:, 0].abs().max() == 0
+    unsure = replace(same, channel_confidence=view.channel_confidence * 0 + 51)  # a fifth
+    shares = torch.expm1(voted_logits(m, [(unsure, view.cam_from_world)])[changed]) / math.expm1(SEED_LOGIT)
+    assert torch.allclose(shares[:, 1], torch.tensor(0.2), atol=1e-4)
     unknown = replace(same, channels=torch.full_like(view.channels, VOID))
     assert torch.equal(voted_logits(m, [(unknown, view.cam_from_world)]), m.class_logits)
 
