@@ -11,7 +11,7 @@ void main() {
   ivec2 at = ivec2(int(index) % wide, int(index) / wide);
   vec4 ball = texelFetch(places, at, 0);
   color = texelFetch(colors, at, 0);
-  vec2 named = texelFetch(classes, at, 0).rg; // paler where it is unsure
+  vec2 named = texelFetch(classes, at, 0).rg; // paler where it is uncertain
   if (byClass) color.rgb = mix(vec3(0.9), texelFetch(palette, ivec2(int(named.r * 255.0 + 0.5), 0), 0).rgb, named.g);
   vec4 cone = texelFetch(cones, at, 0);
   if (cone.xyz != vec3(0)) color.a *= smoothstep(cone.w - 0.35, cone.w, dot(normalize(cone.xyz), normalize(place - ball.xyz)));

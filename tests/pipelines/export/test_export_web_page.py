@@ -55,7 +55,7 @@ def part(text: str, name: str) -> str:
 def unpacked(text: str) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
     """What the page's script makes of it: about, (M, 4) places and radii, (M, 5) colours, opacities and classes."""
     about = json.loads(part(text, "about"))
-    planes = np.frombuffer(gzip.decompress(base64.b64decode(part(text, "map"))), np.uint8).reshape(13, about["count"])
+    planes = np.frombuffer(gzip.decompress(base64.b64decode(part(text, "map"))), np.uint8).reshape(14, about["count"])
     steps = np.cumsum(planes[0:6:2].astype(np.int64) * 256 + planes[1:6:2], axis=1) % 65536
     low, high = np.array(about["low"])[:, None], np.array(about["high"])[:, None]
     logs = low + (high - low) * steps / 65535
