@@ -47,7 +47,7 @@ from .learning import learn
 from .network import NetworkLike
 from .room import KINDS, kind_of
 
-SETS = {"choose": (1000, 40), "judge": (2000, 40), "learn": (30_000, 2000)}
+SETS = {"choose": (1000, 40), "judge": (2000, 40), "learn": (30_000, 2000), "apart": (7000, 40)}
 WALKS = {"choose": (3000, 20), "judge": (4000, 20)}
 """First seed and number of rooms; seeds without a place to walk are passed over."""
 SURE, OFF = 0.3, 0.05
