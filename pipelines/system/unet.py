@@ -38,7 +38,7 @@ class UNet(nn.Module):
     def forward(self, planes: Tensor) -> Tensor:
         """Map planes (B, before, h, w) to (B, after, h, w)."""
         height, width = planes.shape[2:]
-        x = F.pad(planes, (0, -width % 8, 0, -height % 8), mode="replicate")
+        x = F.pad(planes.to(self.out.weight.dtype), (0, -width % 8, 0, -height % 8), mode="replicate")
         stack = []
         for level, down in enumerate(self.down):
             x = down(x if level == 0 else F.avg_pool2d(x, 2))
@@ -47,9 +47,15 @@ class UNet(nn.Module):
         for up in reversed(self.up):
             x = up(torch.cat([F.interpolate(x, scale_factor=2, mode="nearest"), stack.pop()], 1))
         found: Tensor = self.out(x)[:, :, :height, :width]
-        return found
+        return found.float()
 
     def fuse(self) -> None:
         """Take the normalisations into the convolutions, for a network that learns no more."""
         for block in (*self.down, *self.up):
             block.fuse()
+
+    def lighten(self) -> None:
+        """Convolve in bfloat16 on processors that multiply such numbers, in less than half of the time."""
+        if getattr(torch.cpu, "_is_avx512_bf16_supported", bool)():
+            for part in (self.down, self.up, self.out):
+                part.bfloat16()

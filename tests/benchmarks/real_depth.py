@@ -76,6 +76,7 @@ def leave_cases(run: RunFolder, truth: Path | None, target: Path) -> None:
     matches.mkdir(parents=True, exist_ok=True)
     stereo = MultiviewDepth(sequence, config.stereo_side, STEREO_PLANES, lambda: matches, 1, SilentProgress())
     stereo.precompute(sequence.frames)
+    stereo.all_speak = True
     index = {int(f): k for k, f in enumerate(run.load(BACKBONE).frame_ids)}
     truths = hide_balls(stereo, run.load(BACKBONE)) if truth is None else true_depths(run, truth)
     known = [i for i in index if i in truths]

@@ -71,10 +71,11 @@ class Candidates:
     weight: Array
 
 
-def find_candidates(own: HalfResKeyframe, lent: Array, mass: Array, sure: NDArray[np.bool_]) -> Candidates:
-    """List what the pixels of a keyframe that are not `sure` (h, w) could have, from those that are, by their own match
-    or by the inverse depths lent by others (h, w), who agree as much as `mass` (h, w) says."""
-    pixels = np.flatnonzero(~sure)
+def find_candidates(
+    own: HalfResKeyframe, lent: Array, mass: Array, sure: NDArray[np.bool_], pixels: NDArray[np.int64]
+) -> Candidates:
+    """List what `pixels` (P,) of a keyframe that are not `sure` (h, w) could have, from those that are, by their own
+    match or by the inverse depths lent by others (h, w), who agree as much as `mass` (h, w) says."""
     known_inverse_depth = np.where(sure & (own.confidence < SURE) | (own.confidence <= 0), lent, own.inverse)
     values = np.where(sure, known_inverse_depth, np.float32(0)).astype(np.float32)
     inverse = np.zeros((len(KINDS), *sure.shape), np.float32)
@@ -103,6 +104,32 @@ def _nearest(sure: NDArray[np.bool_]) -> NDArray[np.int32]:
     place = np.zeros(int(label.max()) + 1, np.int32)
     place[label[sure]] = np.flatnonzero(sure)
     return np.asarray(place[label], np.int32)
+
+
+def find_speakers(sure: NDArray[np.bool_], lab: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Choose those of the U pixels that are not sure (h, w) for which candidates are weighed, flat indices (P,), and
+    who of them speaks for each of all (U,): half of them, as the fields of a chessboard, each for itself and for those
+    beside it whose colour (h, w, 3) is more like its own than the others' around them."""
+    speaker = np.empty(sure.shape, np.int64)
+    _point_to_speakers(sure, lab, speaker)
+    chosen, number = np.unique(speaker[~sure], return_inverse=True)
+    return chosen, number.reshape(-1)
+
+
+@kernel
+def _point_to_speakers(sure: NDArray[np.bool_], lab: Array, speaker: NDArray[np.int64]) -> None:
+    height, width = sure.shape
+    for y in range(height):
+        for x in range(width):
+            speaker[y, x], least = y * width + x, np.inf
+            for way in range(4 * ((y + x) % 2)):
+                row, column = y + (way == 0) - (way == 1), x + (way == 2) - (way == 3)
+                if 0 <= row < height and 0 <= column < width and not sure[row, column]:
+                    apart = 0.0
+                    for c in range(3):
+                        apart += (lab[row, column, c] - lab[y, x, c]) ** 2
+                    if apart < least:
+                        speaker[y, x], least = row * width + column, apart
 
 
 @kernel
@@ -148,7 +175,7 @@ def _walk_lines(
 class CompletionInputs:
     """Basis of a completion: what a keyframe is `sure` of (h, w), by its own match or by inverse depths that are lent
     (h, w); of P other `pixels` (flat indices), inverse depths of candidates (P, K) and evidence for them (P, K, F), and
-    what is known of each place (P, G)."""
+    what is known of each place (P, G); and which of them speaks for each of all U pixels that are not sure (U,)."""
 
     own: HalfResKeyframe
     lent: Array
@@ -157,11 +184,17 @@ class CompletionInputs:
     inverse: Array
     evidence: Bytes
     place: Bytes
+    speaker: NDArray[np.int64]
 
     @property
     def from_other_views(self) -> NDArray[np.bool_]:
         """(h, w) where others are sure and the keyframe is not."""
         return self.sure & (self.own.confidence < SURE)
+
+    @property
+    def unsure(self) -> NDArray[np.int64]:
+        """(U,) flat indices of the pixels that are not sure."""
+        return np.flatnonzero(~self.sure)
 
     @property
     def known_inverse_depth(self) -> Array:
@@ -174,10 +207,12 @@ def build_inputs(
     lenders: list[HalfResKeyframe],
     lent: list[NDArray[np.float64]],
     asked: list[NDArray[np.float64]],
+    all_speak: bool = False,
 ) -> CompletionInputs | None:
     """Gather all that the completion of a keyframe rests on; None with hardly any sure pixel.
 
     `lent` (3, 4) lead from the lenders' pixels to the keyframe's, `asked` back from it to those of the first of them.
+    Candidates are of the pixels that speak for the others, or of all that are not sure.
     """
     unsure = own.confidence < SURE
     if (~unsure).sum() < _LEAST_PIXELS:
@@ -188,11 +223,14 @@ def build_inputs(
     ]
     depth, mass = agreed_depth(carried, unsure) if carried else (np.zeros_like(own.inverse),) * 2
     borrowed, sure = invert(depth), ~unsure | (mass > _LEAST)
-    found = find_candidates(own, borrowed, mass, sure)
+    pixels, speaker = find_speakers(sure, own.lab)
+    if all_speak:
+        pixels, speaker = np.flatnonzero(~sure), np.arange((~sure).sum())
+    found = find_candidates(own, borrowed, mass, sure, pixels)
     evidence = np.empty((*found.inverse.shape, OF_CANDIDATE), np.uint8)
     _weigh_support(found.pixels, found.support, found.weight, own.lab, evidence)
     places = _describe_places(found.pixels, own, mass, sure)
-    inputs = CompletionInputs(own, borrowed, sure, found.pixels, found.inverse, evidence, places)
+    inputs = CompletionInputs(own, borrowed, sure, found.pixels, found.inverse, evidence, places, speaker)
     return update_view_evidence(inputs, lenders[:ASKED], asked)
 
 

@@ -57,7 +57,8 @@ _BLOCK = 1024
 class Inputs:
     """What the network reads of one keyframe: planes (10, h, w); of the P unsure pixels flat indices (P,), evidence of
     their candidates (P, K, OF_CANDIDATE) and places (P, OF_PLACE) as of `CompletionInputs`, which candidates there are
-    (P, K) and their log inverse depths (P, K) over the keyframe's median, whose logarithm is `reference`."""
+    (P, K) and their log inverse depths (P, K) over the keyframe's median, whose logarithm is `reference`; flat indices
+    of all unsure pixels (U,) and who speaks for each, None where these are the P."""
 
     planes: Tensor
     pixels: Tensor
@@ -66,6 +67,8 @@ class Inputs:
     real: Tensor
     logs: Tensor
     reference: float
+    unsure: Tensor | None = None
+    speaker: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -92,9 +95,10 @@ def inputs_of(inputs: CompletionInputs, device: str = "cpu") -> Inputs:
     inverse = inputs.inverse
     real = inverse > 0
     logs = np.where(real, np.log(np.maximum(inverse, 1e-9)) - np.float32(reference), np.float32(0))
-    arrays = (planes, inputs.pixels, inputs.evidence, inputs.place, real, logs)
-    planes_, pixels, evidence, place, there, of = (torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays)
-    return Inputs(planes_, pixels, evidence, place, there, of, reference)
+    arrays = (planes, inputs.pixels, inputs.evidence, inputs.place, real, logs, inputs.unsure, inputs.speaker)
+    tensors = [torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays]
+    planes_, pixels, evidence, place, there, of, unsure, speaker = tensors
+    return Inputs(planes_, pixels, evidence, place, there, of, reference, unsure, speaker)
 
 
 def numbers_of(kept: Tensor) -> Tensor:
@@ -180,7 +184,10 @@ class CompletionNetwork(UNet):
         read = [self.read(*self._numbers(given, b), given.real[b]) for b in blocks]
         gathered = [self.gather(h, given.real[b]) for h, b in zip(read, blocks, strict=True)]
         planes = given.planes[None].contiguous(memory_format=torch.channels_last)
-        around = self.find_context(planes, given.pixels, torch.cat(gathered))[0]
+        features, at = torch.cat(gathered), given.pixels
+        if given.unsure is not None and given.speaker is not None:
+            features, at = features[given.speaker], given.unsure
+        around = self.find_context(planes, at, features)[0]
         context = around[..., :-1].flatten(0, 1)[given.pixels]
         parts = [self.weigh(h, given.real[b], g, context[b]) for h, g, b in zip(read, gathered, blocks, strict=True)]
         share, moved, spread = (torch.cat(column) for column in zip(*parts, strict=True))
@@ -220,6 +227,8 @@ def load_network(device: str = "cpu") -> CompletionNetwork:
     network.fuse()
     # Convolutions take two thirds of the time with the channels last.
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    if device == "cpu":
+        network.lighten()
     return network.to(device)
 
 
@@ -258,10 +267,10 @@ def complete(inputs: CompletionInputs, device: str) -> tuple[Array, Array]:
     error = np.exp(found.log_scale_known.cpu().numpy())
     if len(inputs.pixels):
         logs, risk = (x.cpu().numpy() for x in mixture_median(found))
-        inverse.ravel()[inputs.pixels] = np.exp(logs + np.float32(given.reference))
+        inverse.ravel()[inputs.unsure] = np.exp(logs + np.float32(given.reference))[inputs.speaker]
         smooth = cv2.bilateralFilter(np.log(np.maximum(inverse, 1e-9)), -1, _LIKE_DEPTH, max(inverse.shape) * _SMOOTHED)
         inverse = np.where(inputs.sure, inverse, np.exp(smooth))
-        error.ravel()[inputs.pixels] = risk
+        error.ravel()[inputs.unsure] = risk[inputs.speaker]
     return invert(inverse), error
 
 

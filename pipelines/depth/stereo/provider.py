@@ -63,6 +63,8 @@ class MultiviewDepth:
     metric = False
     name = "multiview"
     shared_state = ()
+    all_speak = False
+    """Whether candidates are gathered for all pixels, as what is learned from wants them, or for half."""
 
     def __init__(
         self,
@@ -173,7 +175,7 @@ class MultiviewDepth:
         lenders = self._lenders(index)
         lent = [self._half_warps(j, np.array([index]))[0] for j in lenders.tolist()]
         halves = [self._half(j) for j in lenders.tolist()]
-        return build_inputs(self._half(index), halves, lent, self._half_warps(index, lenders[:ASKED]))
+        return build_inputs(self._half(index), halves, lent, self._half_warps(index, lenders[:ASKED]), self.all_speak)
 
     def _complete_first(self, index: int) -> HalfResKeyframe:
         inputs = self.first_inputs(index)

@@ -76,6 +76,7 @@ def room_cases(seed: int, folder: Path, device: str = "cpu") -> list[tuple[Compl
     maps = folder / "stereo" / str(seed)
     try:
         provider, frames = clip.stereo(maps, device)
+        provider.all_speak = True
         if (as_worn or seed % 5 == 4) and rng.random() < 0.75:
             _match_falsely(provider, seed)
         kept = np.sort(rng.permutation(len(frames))[:_KEPT])

@@ -97,7 +97,7 @@ def test_both_rounds_of_completion_ask_the_same_views_where_one_is_missing(
         if file.name != stereo._path(missing.id).name:
             shutil.copy(file, tmp_path)
     asked: list[list[np.ndarray]] = []
-    monkeypatch.setattr(stereo_provider, "build_inputs", lambda own, lenders, lent, warps: asked.append(warps) or True)
+    monkeypatch.setattr(stereo_provider, "build_inputs", lambda *given: asked.append(given[3]) or True)
     monkeypatch.setattr(stereo_provider, "update_view_evidence", lambda case, others, warps: asked.append(warps))
     monkeypatch.setattr(fresh, "_completed", lambda index: index)
     fresh.inputs(4)
