@@ -69,7 +69,7 @@ EXPORTS = (
             ExportedFile(
                 WEB_PAGE,
                 "the map in one page, easy to share: 20 MB at most, no server or network needed; "
-                "colours and classes, orbit and walk, the camera's path, a measuring tape",
+                "colours and classes (paler where uncertain), orbit and walk, the camera's path, a measuring tape",
                 "any browser with WebGL 2, on a computer or a phone",
             ),
         ),

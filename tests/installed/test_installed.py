@@ -96,7 +96,7 @@ def module_of(path: Path) -> str:
 def test_names_of_modules_in_strings_are_modules() -> None:
     texts = [path.read_text(encoding="utf-8") for path in sources()]
     named = {m for text in texts for m in re.findall(r'"(msgs_slam(?:\.\w+)+)"', text)}
-    later = {f"msgs_slam.pipelines.{m}" for text in texts for m in re.findall(r'\bLater\("([\w.]+)"', text)}
+    later = {f"msgs_slam.pipelines.{m}" for text in texts for m in re.findall(r'\bLazyFunction\("([\w.]+)"', text)}
     assert later
     assert named | later <= {module_of(path) for path in sources()} | {"msgs_slam.msgs_cli.log_format"}
 
