@@ -33,10 +33,9 @@ def of_window(bundle: Bundle, window: range) -> pycolmap.Reconstruction:
 
 def in_windows(
     readouts: Sequence[Readout | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, readout: float = READOUT
-) -> tuple[AdjustedModel | None, list[pycolmap.Reconstruction], list[str]]:
-    """The joined windows of a held camera, each of which has found another readout, or (None) nothing; and what was
-    warned of."""
-    bundle, warned = seen_by(readout)[0], []
+) -> tuple[AdjustedModel | None, list[pycolmap.Reconstruction]]:
+    """The joined windows of a held camera, each of which has found another readout, or (None) nothing."""
+    bundle = seen_by(readout)[0]
     xy = [bundle.obs_xy[bundle.obs_cam == k] for k in range(COUNT)]
     found = {
         w: None if r is None else AdjustedModel(of_window(bundle, w), "global", 0.0, 1.0, r)
@@ -48,20 +47,20 @@ def in_windows(
     structure = StructureFromMotion(
         config=FramesConfig(), camera=camera, is_fixed=True, snapshots=Snapshots(tmp_path), progress=SilentProgress(),
         threads=1, seed=0, extract=lambda _: None, picture=lambda _: None, time=float,
-        match=lambda *_: None, warn=warned.append,
+        match=lambda *_: None,
     )  # type: ignore[arg-type, return-value] # fmt: skip
-    return *structure._in_windows(WINDOWS, KeyframeSet(nothing, xy, TIMES, []), []), warned
+    return structure._in_windows(WINDOWS, KeyframeSet(nothing, xy, TIMES, []), [])
 
 
 def test_the_readout_is_that_of_all_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first shows none, as a window does in which the camera stands still: it used to decide for all."""
     late = (0.0, 0.8 * READOUT)
-    whole, others, warned = in_windows([NO_READOUT, late, late], tmp_path, monkeypatch)
+    whole, others = in_windows([NO_READOUT, late, late], tmp_path, monkeypatch)
     assert whole is not None
     assert whole.readout[0] == 0
     assert whole.readout[1] == pytest.approx(READOUT, rel=0.03)
-    assert (others, warned) == ([], [])
-    alone, _, _ = in_windows([NO_READOUT] * 3, tmp_path, monkeypatch)
+    assert others == []
+    alone, _ = in_windows([NO_READOUT] * 3, tmp_path, monkeypatch)
     assert alone is not None
     assert 0 < off_by(poses_of(whole.model)) < 0.4 * off_by(poses_of(alone.model))
 
@@ -69,7 +68,7 @@ def test_the_readout_is_that_of_all_windows(tmp_path: Path, monkeypatch: pytest.
 def test_what_one_window_takes_for_a_readout_is_none_where_the_whole_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole, _, _ = in_windows([(0.0, 0.01), NO_READOUT, NO_READOUT], tmp_path, monkeypatch, readout=0.0)
+    whole, _ = in_windows([(0.0, 0.01), NO_READOUT, NO_READOUT], tmp_path, monkeypatch, readout=0.0)
     assert whole is not None
     assert whole.readout == NO_READOUT
 
@@ -92,21 +91,19 @@ def test_a_camera_is_the_mean_of_all_windows_by_how_sure_they_are() -> None:
 
 
 @pytest.mark.parametrize("failed", [0, 1])
-def test_a_window_without_a_model_is_told_of_and_costs_only_itself(
+def test_a_window_without_a_model_costs_only_itself(
     failed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All at once would take more memory than there is."""
     readouts = [None if n == failed else NO_READOUT for n in range(3)]
-    whole, others, warned = in_windows(readouts, tmp_path, monkeypatch)
+    whole, others = in_windows(readouts, tmp_path, monkeypatch)
     assert whole is not None
     placed = [{i - 1 for i in m.reg_image_ids()} for m in (whole.model, *others)]
     if failed == 0:
         assert placed == [set(range(8, COUNT))]
     else:
         assert placed == [set(WINDOWS[0]), set(WINDOWS[2])]
-    assert len(warned) == 1
-    assert "3 windows: 1 gave no model" in warned[0]
 
 
 def test_no_window_with_a_model_is_no_structure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert in_windows([None] * 3, tmp_path, monkeypatch) == (None, [], [])
+    assert in_windows([None] * 3, tmp_path, monkeypatch) == (None, [])

@@ -44,7 +44,7 @@ def test_results_come_in_order_whatever_is_lost(cluster: RayCluster, tmp_path: P
     for name in ("never", "once", "always"):
         (tmp_path / name).mkdir()
     assert each(cluster, task_calls.die, [(tmp_path / "never", 0), (tmp_path / "once", 1)], tmp_path) == [1, 2]
-    with pytest.raises(RecoverableError, match=rf"lost {RETRIES + 1} times .* the same command goes on"):
+    with pytest.raises(RecoverableError, match=rf"lost {RETRIES + 1} times .* the same command continues"):
         each(cluster, task_calls.die, [(tmp_path / "always", 99)], tmp_path)
     assert len(list((tmp_path / "always").iterdir())) == RETRIES + 1
 
