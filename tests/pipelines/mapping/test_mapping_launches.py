@@ -22,6 +22,6 @@ def test_a_card_is_asked_for_little_and_seldom_waited_for() -> None:
     assert (poses["reads"], poses["bytes from it"]) == (1, 2 * 16 * 4)
     assert noting["launches"] <= 72
     assert (noting["reads"], noting["bytes from it"]) == (1, 0)
-    assert votes["launches"] <= 40 * VIEWS
+    assert votes["launches"] <= 60 * VIEWS  # one pass by class, one for the whole
     assert stereo["launches"] <= 36  # matched at two sizes
     assert stereo["reads"] == 5
