@@ -27,6 +27,7 @@ from ..system.raster import draw_faces
 from ..types import Metres
 from .holes import cut_light, cut_map, cut_mesh, holes_in
 from .inventory import NO_THINGS, THINGS, FoundThings, Selection, Thing, in_metres, load_things
+from .things import of_faces
 
 MESH_GLB = "mesh.glb"
 _DRAWN, _AROUND = 320, 12
@@ -189,9 +190,9 @@ def draw_things(outcome: Outcome, mesh: MeshArrays, numbers: NDArray[np.uint16])
     """(h, w) numbers of the things, 0 for none, that each keyframe shows, by its row; of the vertices' numbers (V,) of
     a mesh in the outcome's world."""
     camera, t = outcome.calibration.intrinsics.at_most(_DRAWN), outcome.trajectory
-    a, b, c = numbers[mesh.faces].T
-    of_face = np.append(np.where((a == b) | (a == c), a, np.where(b == c, b, 0)), 0).astype(np.uint16)  # -1 is the last
+    of_face = np.append(of_faces(numbers.astype(np.int64), mesh.faces), 0).clip(min=0).astype(np.uint16)
     rows = np.flatnonzero(t.is_keyframe & t.is_posed).tolist()
+    # Where no face is drawn it is number -1, the last.
     return {row: of_face[draw_faces(mesh.vertices, mesh.faces, t.cam_from_world[row], camera).face] for row in rows}
 
 

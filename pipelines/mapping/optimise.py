@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..config import MappingConfig
 from ..geometry.posed_depth import overlaps
-from ..render.api import Rendering, class_weights, in_view, marked_in_view, project_map, render
+from ..render.api import Rendering, blending_weights, class_weights, in_view, marked_in_view, project_map, render
 from ..render.gaussian_map import GaussianMap
 from ..render.rules import GaussianStats
 from ..system import gpu
@@ -422,10 +422,9 @@ def voted_logits(gaussian_map: GaussianMap, posed: Iterable[tuple[View, Tensor]]
     votes = torch.zeros_like(gaussian_map.class_logits)
     total = votes.new_zeros(len(votes), 1)
     for view, pose in posed:
-        seen = gaussian_map, pose, view.intrinsics, view.channels
-        votes.index_add_(0, *class_weights(*seen, view.label_weight))
-        rows, whole = class_weights(*seen, torch.ones_like(view.label_weight))
-        total.index_add_(0, rows, whole.sum(1, keepdim=True))
+        votes.index_add_(0, *class_weights(gaussian_map, pose, view.intrinsics, view.channels, view.label_weight))
+        named = (view.channels < votes.shape[1]).to(votes)
+        total[:, 0] += blending_weights(gaussian_map, pose, view.intrinsics, counts=named)[0]
     # In place: a number for each class and Gaussian is a large table.
     votes.div_(total.clamp(min=_MIN_VOTES)).div_(_FLOOR).log1p_()
     unseen = total[:, 0] <= _MIN_VOTES

@@ -223,9 +223,8 @@ def build_inputs(
     ]
     depth, mass = agreed_depth(carried, unsure) if carried else (np.zeros_like(own.inverse),) * 2
     borrowed, sure = invert(depth), ~unsure | (mass > _LEAST)
-    pixels, speaker = find_speakers(sure, own.lab)
-    if all_speak:
-        pixels, speaker = np.flatnonzero(~sure), np.arange((~sure).sum())
+    unknown = np.flatnonzero(~sure)
+    pixels, speaker = (unknown, np.arange(len(unknown))) if all_speak else find_speakers(sure, own.lab)
     found = find_candidates(own, borrowed, mass, sure, pixels)
     evidence = np.empty((*found.inverse.shape, OF_CANDIDATE), np.uint8)
     _weigh_support(found.pixels, found.support, found.weight, own.lab, evidence)
