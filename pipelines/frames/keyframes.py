@@ -19,6 +19,7 @@ from ..sfm.flow import find_corners, follow
 from ..source.faces import Faces
 from ..source.picking import Motion, reduce_image, sharpest_of_windows, sharpness
 from ..source.recording import Recording
+from ..system.parallel import map_lookahead, read_ahead
 from ..types import Frame
 
 PICKED, LOSSLESS = "picked", "lossless"
@@ -159,7 +160,8 @@ def _sharpest(
     context: StageContext, source: Recording, rate: float, motion: Motion
 ) -> Iterator[tuple[VideoFrame, float]]:
     """The sharpest images with their sharpness, by whose `motion` it is judged whether these are enough."""
-    pictures = context.progress.track(source.read(warn=context.warn), "picking", source.expected_frames or None)
+    decoded = read_ahead(source.read(warn=context.warn), context.threads)
+    pictures = context.progress.track(decoded, "picking", source.expected_frames or None)
     if rate <= 0:
         yield from sharpest_of_windows(pictures, rate)
         return
@@ -177,12 +179,20 @@ def _saved(
 ) -> list[Frame]:
     """The frames of images with their sharpness, each written to the snapshot."""
     frames: list[Frame] = []
-    for picture, score in chosen:
-        frame_id = len(frames)
-        timestamp = picture.timestamp if source.is_timed() else _untimed(context.config.frames, frame_id)
-        name = source.name(frame_id, picture.source_index)
-        frames.append(Frame(frame_id, name, timestamp, picture.source_index, score))
-        _save_selected(context, source, picture, name, faces, keep_lossless)
+
+    def named() -> Iterator[tuple[VideoFrame, str]]:
+        for picture, score in chosen:
+            frame_id = len(frames)
+            timestamp = picture.timestamp if source.is_timed() else _untimed(context.config.frames, frame_id)
+            name = source.name(frame_id, picture.source_index)
+            frames.append(Frame(frame_id, name, timestamp, picture.source_index, score))
+            yield picture, name
+
+    def save(one: tuple[VideoFrame, str]) -> None:
+        _save_selected(context, source, *one, faces, keep_lossless)
+
+    for _ in map_lookahead(save, named(), context.threads):
+        pass
     return frames
 
 

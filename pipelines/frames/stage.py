@@ -26,7 +26,7 @@ from ..source.extending import is_extension, with_earlier_poses
 from ..source.faces import find_faces, has_panorama_shape, level_mosaic
 from ..source.given import given_poses
 from ..source.recording import FolderRecording, Recording, open_recording
-from ..system.parallel import parallel_map
+from ..system.parallel import parallel_map, read_ahead
 from ..types import Calibration, Frame
 from .findings import (
     in_world_of,
@@ -141,7 +141,7 @@ class FramesStage:
 
         parallax = self.config.parallax
         while True:
-            choice = choose_keyframes(pictures(), parallax / across)
+            choice = choose_keyframes(read_ahead(pictures(), self.context.threads), parallax / across)
             if not self.config.poses:
                 require_motion(choice.largest_displacement * across, choice.has_detail)
             if len(choice.keyframes) >= min(_FEW_KEYFRAMES, len(places)) or parallax < self.config.parallax / 3:

@@ -27,6 +27,7 @@ from ..sfm.rolling import Shutter, velocities
 from ..source.faces import find_faces
 from ..source.picking import reduce_image
 from ..source.recording import Recording, open_recording
+from ..system.parallel import read_ahead
 from ..system.progress import is_asked
 from ..system.values import load_value, save_value
 from ..system.wording import stretches
@@ -112,7 +113,8 @@ def place_all(context: StageContext, source: Recording, placer: Placer) -> list[
     placed: list[Placed] = load_value(snapshot) if snapshot.exists() else []
     done = placer.picked | {p.index for p in placed}
     left = max(source.expected_frames - len(done), 0)
-    for picture, images in context.progress.track(_cut(context, source, done), "frames between", left or None):
+    cut = read_ahead(_cut(context, source, done), context.threads)
+    for picture, images in context.progress.track(cut, "frames between", left or None):
         if (found := placer.place(picture.source_index, picture.timestamp, images)) is not None:
             placed.append(found)
             if len(placed) % _SNAPSHOT_EVERY == 0 or is_asked():

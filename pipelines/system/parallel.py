@@ -8,7 +8,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
 from threading import Lock
-from typing import Generic, TypeVar, overload
+from typing import Any, Generic, TypeVar, overload
 
 from .machine import release_free_memory
 
@@ -38,6 +38,15 @@ def _submitted(pool: ThreadPoolExecutor, function: Callable[[T], R], item: T) ->
 def map_lookahead(function: Callable[[T], R], items: Iterable[T], threads: int) -> Iterator[R]:
     """`map`, in order, with `LOOKAHEAD` items in work where there is more than one thread: no more need memory."""
     return parallel_map(function, items, LOOKAHEAD, LOOKAHEAD) if threads >= LOOKAHEAD else map(function, items)
+
+
+def read_ahead(items: Iterable[T], threads: int) -> Iterator[T]:
+    """The items; where there is more than one thread, the next is made on another one while one of them is used."""
+    if threads < LOOKAHEAD:
+        return iter(items)
+    source, end = iter(items), object()
+    made: Iterator[Any] = parallel_map(lambda _: next(source, end), itertools.repeat(None), 1, 1)
+    return itertools.takewhile(lambda item: item is not end, made)
 
 
 class LruCache(Generic[K, R]):

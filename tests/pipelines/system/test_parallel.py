@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from msgs_slam.pipelines.system.parallel import LOOKAHEAD, LruCache, map_lookahead, parallel_map
+from msgs_slam.pipelines.system.parallel import LOOKAHEAD, LruCache, map_lookahead, parallel_map, read_ahead
 
 
 class Crowd:
@@ -58,6 +58,41 @@ def test_an_error_comes_in_its_place(map_) -> None:  # type: ignore[no-untyped-d
     assert [next(results), next(results)] == [-1, -1]
     with pytest.raises(ZeroDivisionError):
         next(results)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_what_is_read_ahead_comes_in_order_and_is_one_item_more(threads: int) -> None:
+    made: list[int] = []
+
+    def numbers() -> Iterator[int]:
+        for number in range(5):
+            made.append(number)
+            yield number
+        raise ValueError("no sixth")
+
+    ahead = read_ahead(numbers(), threads)
+    assert next(ahead) == 0
+    if threads == 1:
+        assert made == [0]
+    assert next(ahead) == 1
+    assert len(made) in ((2,) if threads == 1 else (2, 3))
+    assert [next(ahead) for _ in range(3)] == [2, 3, 4]
+    with pytest.raises(ValueError, match="no sixth"):
+        next(ahead)
+
+
+def test_the_next_item_is_made_while_one_is_used() -> None:
+    began = threading.Event()
+
+    def two() -> Iterator[int]:
+        yield 1
+        began.set()
+        yield 2
+
+    ahead = read_ahead(two(), 2)
+    assert next(ahead) == 1
+    assert began.wait(5)
+    assert list(ahead) == [2]
 
 
 def test_what_two_threads_ask_for_is_made_once() -> None:
