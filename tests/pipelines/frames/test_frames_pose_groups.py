@@ -13,7 +13,7 @@ from msgs_slam.pipelines.geometry import se3
 from msgs_slam.pipelines.sfm import components as module
 from msgs_slam.pipelines.sfm.adjust import FEATURE_SD
 from msgs_slam.pipelines.sfm.bundle import Bundle, adjust_bundle
-from msgs_slam.pipelines.sfm.components import MAX_SD, pose_groups, relative_sds, undetermined_cameras
+from msgs_slam.pipelines.sfm.components import MAX_SD, PoseCovariance, pose_groups, undetermined_cameras
 from msgs_slam.pipelines.sfm.consistency import MAX_DRIFT
 from msgs_slam.pipelines.sfm.given import posed_model
 from msgs_slam.pipelines.sfm.rolling import NO_READOUT, RollingModel
@@ -58,7 +58,7 @@ def test_the_deviations_are_those_of_repeated_adjustments() -> None:
         noisy = replace(bundle, obs_xy=xy + rng.normal(0, FEATURE_SD, xy.shape))
         after = adjust_bundle(noisy, intrinsics, width=100.0).bundle.cam_from_world
         found.append(se3.log(after[1] @ se3.inverse(after[0]) @ se3.inverse(poses[1] @ se3.inverse(poses[0]))))
-    pairs, sd = relative_sds(bundle, intrinsics)
+    pairs, sd = PoseCovariance.of(bundle, intrinsics).relative_sds()
     place, turn = np.sqrt((np.array(found) ** 2).mean(0).reshape(2, 3).sum(1))
     told = sd[(pairs == [0, 1]).all(1)]
     assert told == pytest.approx(max(place / np.median(points[:, 2]), turn), rel=0.3)
@@ -71,13 +71,16 @@ def test_neither_the_unit_nor_the_world_matters(strip: tuple[Bundle, Intrinsics]
         bundle, cam_from_world=se3.scaled(bundle.cam_from_world @ se3.inverse(motion), 7.0),
         points=7 * se3.transform(motion, bundle.points),
     )  # fmt: skip
-    assert np.allclose(relative_sds(moved, intrinsics)[1], relative_sds(bundle, intrinsics)[1], rtol=1e-3)
+    there, here = (PoseCovariance.of(b, intrinsics) for b in (moved, bundle))
+    assert np.allclose(there.relative_sds()[1], here.relative_sds()[1], rtol=1e-3)
+    before, after = np.arange(12, 20), np.arange(19, 28)
+    assert there.scale_sd(before, after) == pytest.approx(here.scale_sd(before, after), rel=1e-3)
 
 
 def test_views_of_a_strip_are_alone_and_a_room_holds_its_views_together(strip: tuple[Bundle, Intrinsics]) -> None:
     assert pose_groups(*strip) == [list(range(12, 28)), *([k] for k in STRIP)]
     assert pose_groups(*bundle_of(walk_round(CAMERA))) == [list(range(20))]
-    pairs, sd = relative_sds(*strip)
+    pairs, sd = PoseCovariance.of(*strip).relative_sds()
     beside = pairs[:, 1] - pairs[:, 0] == 1
     assert sd[beside & (pairs[:, 1] < 10)].min() > 1.3 * MAX_SD
     assert sd[beside & (pairs[:, 0] > 13)].max() < 0.6 * MAX_SD
