@@ -110,7 +110,7 @@ def part_loose(state: TrackState, report: Report, intrinsics: Intrinsics, least:
     (`undetermined_cameras`): groups of at least `least` keyframes become segments of their own, for nobody knows their
     scale beside the rest; the frames of smaller ones are lost.
 
-    Frames that were not adjusted themselves go with the keyframes beside them. One or two between others stay.
+    Frames that were not adjusted themselves go with the nearest keyframe. One or two between others stay.
     """
     ids = report.frame_ids
     if len(state.rig) > 1:  # a panorama sees all around
@@ -123,7 +123,7 @@ def part_loose(state: TrackState, report: Report, intrinsics: Intrinsics, least:
     found, apart = undetermined_cameras(report.bundle, intrinsics, segments.values(), least, counted)
     loose = {ids[k] for k in found}
     others = sorted(set(state.poses).difference(ids))
-    loose |= {i for i in others if loose and loose.issuperset(state.nearest_keyframes(i, 1))}
+    loose |= {i for i in others if state.nearest_keyframes(i, 1)[0] in loose}
     held = np.array(sorted(set(state.poses).difference(loose)), np.int64)
     # What holds before and behind a frame or two tells where they are about.
     loose -= {i for a, b in pairwise(held.tolist()) if b - a <= MAX_GAP for i in range(a + 1, b)}

@@ -86,6 +86,25 @@ def test_views_of_a_strip_are_alone_and_a_room_holds_its_views_together(strip: t
     assert sd[beside & (pairs[:, 0] > 13)].max() < 0.6 * MAX_SD
 
 
+@pytest.mark.parametrize(("stride", "groups"), [(0.6, [20]), (0.7, [10, 10])])
+def test_a_long_step_parts_only_where_the_scale_beyond_is_unknown(stride: float, groups: list[int]) -> None:
+    """Along a corridor of which little is seen at a time; no pair holds the two ends of the step together."""
+    rng, intrinsics = np.random.default_rng(0), Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0)
+    ahead = 0.2 * np.arange(20) + stride * (np.arange(20) >= 10)
+    points = rng.uniform([-0.8, -0.6, 2], [0.8, 0.6, 2 + ahead[-1]], (400, 3))
+    local = points - np.pad(ahead[:, None], ((0, 0), (2, 0)))[:, None]
+    xy = 500 * local[..., :2] / local[..., 2:] + [320, 240]
+    is_seen = (local[..., 2] > 1.5) & (local[..., 2] < 2.7) & (np.abs(xy - [320, 240]) < [320, 240]).all(2)
+    cam, point = np.nonzero(is_seen)
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    poses[:, 2, 3] = -ahead
+    none = np.zeros(len(cam))
+    bundle = Bundle(poses, points, cam, point, xy[is_seen], none + 1, none, none + 1, np.full(len(cam), -1))
+    pairs, sd = PoseCovariance.of(bundle, intrinsics).relative_sds()
+    assert sd[(pairs[:, 0] < 10) & (pairs[:, 1] >= 10)].min() > MAX_SD
+    assert [len(group) for group in pose_groups(bundle, intrinsics)] == groups
+
+
 def test_windows_of_many_cameras_find_the_same(
     strip: tuple[Bundle, Intrinsics], monkeypatch: pytest.MonkeyPatch
 ) -> None:
