@@ -292,8 +292,9 @@ class PoseCovariance:
         for k in (np.flatnonzero(np.diff(label)) + 1).tolist():
             before = np.flatnonzero(label[:k] == label[k - 1])[-_SIDE:]
             after = np.append(k - 1, k + np.flatnonzero(label[k:] == label[k])[:_SIDE])
-            crosses = np.isin(self.pairs[:, 0], before) & np.isin(self.pairs[:, 1], after[1:])
-            if len(before) > 1 and crosses.any() and self.scale_sd(before, after) <= MAX_SCALE_SD:
+            a, b = label[self.pairs].T
+            share = ((a == label[k - 1]) & (b == label[k])) | ((a == label[k]) & (b == label[k - 1]))
+            if len(before) > 1 and share.any() and self.scale_sd(before, after) <= MAX_SCALE_SD:
                 label[label == label[k]] = label[k - 1]
                 ties.append((k - 1, k))
         return np.array(ties, np.int64).reshape(-1, 2)
