@@ -306,7 +306,8 @@ class PoseCovariance:
             aside = centers[way] - centers[way].mean(0)
             aside *= sign / max(float((aside**2).sum()), 1e-12)
             step[way, :3] += np.einsum("nij,nj->ni", self.cam_from_world[way, :3, :3], aside)
-        return float(np.sqrt(max(step.ravel() @ self.covariance.reshape(step.size, -1) @ step.ravel(), 0.0)))
+        variance = step.ravel() @ self.covariance.reshape(step.size, -1) @ step.ravel()
+        return float(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def _median_depths(bundle: Bundle) -> Array:
