@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..config import Config
-from ..proxy.maps import EDGE_STEP, mean_iou, squared_log_gradient
+from ..proxy.maps import mean_iou, reliability
 from ..run.folder import RunFolder
 from ..types import ProxyMaps
 
@@ -22,10 +22,7 @@ class Constants:
     """Values of section 4.1, or of the text around the equation, as printed; of a printed range one inside it; the
     comment says where nothing is printed."""
 
-    # (2), (3): reliability of the proxy depth
-    alpha: float = 0.7
-    beta: float = 0.8
-    """An exponent here: as a factor, which is printed, hardly a pixel would pass tau_low."""
+    # (2), (3): reliability of the proxy depth; α and β are the proxy stage's
     gamma: float = 0.5
     steepness: float = 10.0
     """λ of (3), printed without a value."""
@@ -117,12 +114,10 @@ def depth_reliability(
 ) -> NDArray[np.float32]:
     """Eq. (2): U = exp(-α‖∇D̂‖²) · Conf^β · θ^γ, (h, w) in [0, 1] of depth and confidence (h, w); 0 at unknown depth.
 
-    Printed β and γ are factors; U could then not pass 0.4, and so never the thresholds printed. The gradient is that of
-    the logarithm, in steps of a tenth, so that U does not depend on the unit.
+    Printed β and γ are factors; U could then not pass 0.4, and so never the thresholds printed. Here both are
+    exponents. The gradient is that of the logarithm, so that U does not depend on the unit.
     """
-    edges = np.exp(-constants.alpha * squared_log_gradient(depth) / EDGE_STEP**2)
-    u = edges * np.clip(confidence, 0, 1) ** constants.beta
-    return np.asarray(np.where(depth > 0, with_agreement(u, theta, constants), 0), np.float32)
+    return with_agreement(reliability(depth, confidence), theta, constants)
 
 
 def semantic_factor(miou: float, constants: Constants = PAPER) -> float:
