@@ -12,6 +12,8 @@ output = "predicted_depth"        # .tflite: any tensor of the network, also one
 canonical_focal = 1000.0          # depth · focal / canonical_focal is metres; 0: depth is metres as it comes
 focal = [0, 0]                    # of the camera it was trained with, in pixels of its input (`size`), for a
                                   # network without a canonical focal length that is to tell metres
+metres_line = [1.0, 1.0]          # of such a network: true metres are the first times what it says to the power of the
+                                  # second
 relative = ""                     # else "scale", "depth" or "inverse": depth up to scale; depth, or inverse depth, up
                                   # to scale and shift; each frame is then aligned to the triangulated points
 valid = [0.1, 200.0]              # values at or beyond these stops are unknown
@@ -73,6 +75,7 @@ class Card:
     align_corners: bool = False
     canonical_focal: float = 0.0
     focal: tuple[float, ...] = (0.0, 0.0)
+    metres_line: tuple[float, ...] = (1.0, 1.0)
     relative: str = ""
     valid: tuple[float, ...] = (0.0, float("inf"))
     confidence: str = ""
@@ -183,6 +186,8 @@ def _check(card: Card, path: Path) -> None:
         "canonical_focal is 0 or positive": card.canonical_focal >= 0,
         "focal is [fx, fy], positive, and goes with size": card.focal == (0, 0)
         or (len(card.focal) == 2 and min(card.focal) > 0 and all(card.size)),
+        "metres_line is [factor, power], each 0.1 to 10": len(card.metres_line) == 2
+        and all(0.1 <= n <= 10 for n in card.metres_line),
         "groups has one name for each class": len(card.groups) in (0, len(card.classes)),
         "features need text": card.kind != "features" or card.text is not None,
         "segmentation needs classes": card.is_clustered

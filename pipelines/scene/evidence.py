@@ -45,9 +45,9 @@ WORKTOP: Sizes = ((0.90, 0.04, 0.8), (0.74, 0.1, 0.2))
 SURFACE: Sizes = ((0.43, 0.15, 0.35), (0.74, 0.05, 0.4), (0.90, 0.06, 0.25))
 """A level surface without a name: seat or coffee table, table, worktop."""
 
-DISTANCE: Sizes = ((2.2, 0.5, 1.0),)
+DISTANCE: Sizes = ((1.7, 0.65, 1.0),)
 """Median distance of what an indoor video sees. Depths of NYU Depth v2, a thousand rooms filmed by hand, average 2 to
-3 m; a table filmed from near and a hall are a factor of two away."""
+3 m; eleven recordings of desks, offices and rooms have 0.8 to 3.8 m, 1.4 m on average, with 0.6 in the logarithm."""
 
 TOPS = {
     "table": ("table", TABLE),
@@ -67,7 +67,6 @@ TOPS = {
 THINGS = ("door", "level surface", *dict.fromkeys(label for label, _ in TOPS.values()))
 """Sources that are counted: 2 doors, 3 chairs."""
 DOORS = ("door", "double door")
-FLOORS = ("floor", "rug", "carpet", "road", "earth", "ground")
 CEILING_HEIGHT = "ceiling"
 """The kind of evidence that only a room gives."""
 FURNITURE = (*TOPS, "cabinet", "shelf", "storage", "wardrobe")

@@ -31,7 +31,7 @@ from msgs_slam.pipelines.scene.metres import (
     load_seen,
     usual_evidence,
 )
-from msgs_slam.pipelines.scene.room import Scene, camera_height, ceiling_height, floor_trust, sizes_of_things
+from msgs_slam.pipelines.scene.room import Scene, camera_height, ceiling_height, may_have_floor, sizes_of_things
 from msgs_slam.pipelines.system.progress import SilentProgress
 from msgs_slam.pipelines.types import Metres
 
@@ -228,14 +228,11 @@ def test_a_thing_of_two_names_tells_nothing() -> None:
 
 def test_a_table_top_that_is_lowest_is_no_floor() -> None:
     only_table = scene([(FLOOR_PART[0], FLOOR, "table")], CENTRES)
-    assert floor_trust(only_table) is None
+    assert not may_have_floor(only_table)
     assert camera_height(only_table) == []
     assert sizes_of_things(only_table) == []
-    unnamed = replace(scene([(FLOOR_PART[0], FLOOR, "object 3")], CENTRES), is_named=False)
-    named = scene([FLOOR_PART], CENTRES)
-    trusts = [floor_trust(unnamed), floor_trust(named)]
-    assert None not in trusts
-    assert trusts[0] > trusts[1]  # type: ignore[operator]
+    assert may_have_floor(scene([(FLOOR_PART[0], FLOOR, "object 3")], CENTRES))
+    assert may_have_floor(scene([FLOOR_PART], CENTRES))
 
 
 @pytest.mark.parametrize(("low", "high"), [(-2.0, -0.2), (-0.5, 0.0), (-2.0, 2.0), (0.0, 2.0)])
