@@ -149,7 +149,7 @@ _WRONG_NAME, _WRONG_SURFACE = 0.3, 0.4
 reaches a mean IoU of 55 % on ADE20K's validation images (MLPerf Mobile)."""
 
 _NO_FLOOR = 0.15
-"""The chance that the lowest plane is no floor: of seven recordings with one, it was a desk once. That it is called
+"""The chance that the lowest plane is no floor: of nine recordings with one, it was a desk once. That it is called
 one does not count: names by shape go by heights over it."""
 _MOSTLY = 0.5
 _RISE = 0.6

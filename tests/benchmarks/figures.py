@@ -17,7 +17,10 @@ ROOT = Path(__file__).resolve().parents[2]
 KEPT = Path(__file__).with_suffix(".toml")
 _DATE = r"\d+ [A-Z][a-z]+"
 _VALUE = rf"(?:{_DATE}|[-+]?[\d.]*\d|[a-z]+)"
-_WORDS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight")
+_WORDS = (
+    "none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve",
+    "thirteen",
+)  # fmt: skip
 OF_QUALITY = re.compile(r"\d[\d.]*\s+dB\b|\d[\d.]*\s*%\s+mIoU|\d[\d.]*\s+cm\s+RMSE|\d[\d.]*\s*σ")
 """Figures that stand on a page only where the file puts them."""
 
@@ -26,9 +29,9 @@ def stated() -> tuple[dict[str, Any], dict[str, list[str]]]:
     """The figures, those of all metres together with them, and page → its sentences with names in braces."""
     figures = tomllib.loads(KEPT.read_text(encoding="utf-8"))
     pages = figures.pop("pages")
-    metres = [row["metres"] for row in figures.values() if "metres" in row]
-    missed = sum(abs(math.log(guess / true)) > 1.8 * sd / 100 for guess, sd, true in metres)
-    spread = [sd for _, sd, _ in metres]
+    metres = [row["metres"] for row in figures.values() if "metres" in row] + list(figures.pop("metres").values())
+    missed = sum(abs(math.log(ratio)) > 1.8 * sd / 100 for ratio, sd in metres)
+    spread = [sd for _, sd in metres]
     return figures | {
         "least": min(spread), "most": max(spread), "rooms": _WORDS[len(metres)], "missed": _WORDS[missed],
     }, pages  # fmt: skip
