@@ -85,8 +85,7 @@ def list_things(run_path: Path, as_json: bool, as_csv: bool) -> None:
     else:
         head = ["thing", "width x depth x height", "views", "faces", "a thing", "so called"]
         rows = [
-            [t.name, t.size_text, str(t.views), str(t.faces), f"{100 * t.sure:.0f}%", f"{100 * t.class_share:.0f}%"]
-            for t in things
+            [t.name, t.size_text, str(t.views), str(t.faces), f"{100 * t.sure:.0f}%", t.called_text] for t in things
         ]
         say(format_table(head, rows, terminal_width()))
 

@@ -82,6 +82,13 @@ class Thing:
         return self.name.rpartition(" ")[0]
 
     @property
+    def called_text(self) -> str:
+        """The share of it that bears its name; "by shape" where a flat box alone says so, "-" without a name."""
+        if self.label != VOID:
+            return f"{100 * self.class_share:.0f}%"
+        return "-" if self.kind == "object" else "by shape"
+
+    @property
     def size_text(self) -> str:
         """Width x depth x height with the unit, and how certain the longest of them is."""
         known = bool(self.metres)

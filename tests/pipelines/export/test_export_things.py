@@ -101,6 +101,8 @@ def test_they_are_described_in_the_unit_and_in_metres() -> None:
     assert (chair.label, chair.class_share > 0.8, table.label) == (2, True, 255)
     picture = next(t for t in things.table if t.name == "picture 1")
     assert 0 < picture.sure < chair.sure < 1
+    assert chair.called_text.endswith("%")
+    assert (picture.called_text, table.called_text) == ("by shape", "-")
     double = in_metres(things.table, 2.0, 0.1)[table.number - 1]
     assert double.metres == pytest.approx(2 * np.array(table.size))
     assert double.metres_sd[0] == pytest.approx(np.hypot(2 * table.size_sd[0], 0.1 * double.metres[0]), rel=1e-3)
