@@ -28,7 +28,7 @@ from ..system.values import dataclass_from_json
 from ..system.wording import quoted
 from ..types import VOID, Array
 from .light import clustered
-from .things import LARGEST, STRUCTURE, find_things, is_word, of_faces
+from .things import LARGEST, STRUCTURE, find_things, is_word, of_faces, which
 
 _NAMED = 0.3
 """Share of a thing that bears a class's name, from which the thing is called so."""
@@ -264,8 +264,7 @@ class Surroundings:
         turn = np.eye(3) if world.axes == "up" else Z_UP_FROM_Y_DOWN
         z = mesh.vertices.astype(np.float64) @ turn[2]
         bottom, top = np.quantile(z, (0.01, 0.99)) if len(z) else (0.0, 1.0)
-        is_named = np.zeros(256, bool)
-        is_named[[i for i, name in enumerate(names) if is_word(name) and name not in STRUCTURE]] = True
+        is_named = which(names, lambda name: is_word(name) and name not in STRUCTURE)
         return Surroundings(mesh, names, is_named, turn, float(bottom), max(float(top - bottom), 1e-9), step)
 
     def described(self, vertices: NDArray[np.int64], faces: NDArray[np.int64], views: int) -> Thing:

@@ -8,7 +8,7 @@ it in colour and is about rectangular is a thing too, such as a picture or a rug
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -46,6 +46,9 @@ _NAMED = 0.6
 """A patch is no structure where this share of it has the name of something else."""
 _CALLED, _MEETS = 0.5, 0.2
 """Share of a patch that is called structure, and that lies on a plane, with which together it is structure."""
+
+_IN_WALLS, _FLUSH = ("door", "window", "windowpane", "curtain"), 0.9
+"""Names that a bare wall is given too, and the share of a patch on a plane from which they make no thing of it."""
 
 _FLOOR_THICK, _WALL_THICK, _BEHIND, _BESIDE = 0.03, 0.025, 0.05, 0.05
 """In heights of the room: how far a surface may be from its floor or ceiling and from its wall, behind that, and beyond
@@ -100,19 +103,19 @@ def find_things(mesh: MeshArrays, names: Sequence[str], is_upright: bool) -> NDA
     """
     if not len(mesh.faces):
         return np.full(len(mesh.vertices), -1)
-    says_something = np.zeros(256, bool)
-    says_something[[i for i, name in enumerate(names) if is_word(name)]] = True
+    says_something, called = which(names, is_word), which(names, STRUCTURE.__contains__)
     parts = _parts(mesh, says_something)
-    called = np.zeros(256, bool)
-    called[[i for i, name in enumerate(names) if name in STRUCTURE]] = True
     share_called = parts.mean(called[mesh.labels].astype(float))
     is_structure, panel = share_called > _CALLED, np.full(parts.count, -1)
     first, second, meeting = _borders(parts)
     if is_upright:
         on_plane = parts.mean(on_planes(mesh, parts.area, parts.normal).astype(float))
-        share_named = parts.mean((says_something & ~called)[mesh.labels].astype(float))
+        named = says_something & ~called
+        of_thing = parts.mean((named & ~which(names, _IN_WALLS.__contains__))[mesh.labels].astype(float))
+        share_named = parts.mean(named[mesh.labels].astype(float))
         is_structure &= (on_plane > _MEETS) | _reaches_up(parts)
         is_structure |= (on_plane > _CALLED) & (share_named < _NAMED)
+        is_structure |= (on_plane > _FLUSH) & (of_thing < _NAMED)
         panel = _panels(parts, is_structure, first, second)
         is_structure &= panel < 0
     votes = np.zeros((parts.count, 256))
@@ -125,6 +128,11 @@ def find_things(mesh: MeshArrays, names: Sequence[str], is_upright: bool) -> NDA
     mass = np.maximum(parts.size / (parts.step**2 * _JOIN_AREA), 1e-3)
     group = _joined(parts, first[free], second[free], cost, mass)
     return _numbered(mesh, np.where(is_structure, -1, group)[parts.patch])
+
+
+def which(names: Sequence[str], is_one: Callable[[str], bool]) -> NDArray[np.bool_]:
+    """Return of which labels (256,) the name is such a one."""
+    return np.array([is_one(name) for name in names] + [False] * (256 - len(names)))
 
 
 def is_word(name: str) -> bool:

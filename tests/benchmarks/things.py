@@ -158,14 +158,16 @@ def precision(mine: NDArray, sure: NDArray, true: NDArray, area: NDArray) -> dic
         for number in np.argsort(-sure, kind="stable").tolist():
             inside = mine == number + 1
             whole, shared = area[inside].sum(), np.zeros(len(numbers))
-            if whole == 0 or area[inside & ignored].sum() > 0.5 * whole:
-                continue
+            beside = area[inside & ignored].sum()
             for k, n in enumerate(numbers):
                 both = area[inside & (true == n)].sum()
-                shared[k] = both / (whole - area[inside & ignored].sum() + size[n] - both) if n not in taken else 0
+                shared[k] = both / (whole - beside + size[n] - both) if n not in taken else 0
             best = int(shared.argmax()) if numbers else 0
-            hits.append(bool(numbers) and shared[best] >= threshold)
-            taken |= {numbers[best]} if hits[-1] else set()
+            is_hit = bool(numbers) and shared[best] >= threshold
+            if not is_hit and beside >= 0.5 * whole:
+                continue
+            hits.append(is_hit)
+            taken |= {numbers[best]} if is_hit else set()
         found[f"AP{100 * threshold:.0f}"] = round(100 * average_precision(np.array(hits, bool), len(numbers)), 1)
         found[f"found {100 * threshold:.0f}"] = int(sum(hits))
     return found | {"things": len(sure), "true": len(numbers)}

@@ -89,6 +89,15 @@ def test_things_are_found_whatever_the_network_calls_them(degrees: float) -> Non
     assert (true[by_class == 0] == 2).mean() > 0.9
 
 
+def test_a_bare_wall_that_is_called_a_curtain_is_none() -> None:
+    mesh, true = room()
+    wall = (true == 0) & (mesh.vertices[:, 1] > 5 - 1e-4) & (mesh.vertices[:, 2] > 0.1)
+    before = find_things(mesh, NAMES, True)
+    called = replace(mesh, labels=np.where(wall, 3, mesh.labels).astype(np.uint8))
+    assert (find_things(called, (*NAMES[:3], "curtain"), True) == before).all()
+    assert (find_things(called, (*NAMES[:3], "wardrobe"), True)[wall] >= 0).mean() > 0.9
+
+
 def test_they_are_described_in_the_unit_and_in_metres() -> None:
     mesh, _ = room(33.0)
     things = things_in(mesh, NAMES, UPRIGHT, [])
