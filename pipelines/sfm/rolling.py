@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from ...formats.colmap import ModelArrays
 from ...formats.errors import InputError
 from ..geometry import se3
+from ..system.parallel import parallel_map
+from ..system.threads import get_threads
 from ..types import Array, Intrinsics
 from . import bundle_kernels as kernels
 from .adjust import LOSS_SD, adjust_model, bundle_adjust, robust_cost
@@ -238,16 +240,17 @@ def weigh_readout(rolling: RollingModel, readout: Readout) -> ReadoutEvidence:
     """
     bundle, xy, pinhole = rolling.bundle()
     held = _held_out(bundle)
-    costs, depths = [], []
-    for tried in (NO_READOUT, readout):
+
+    def adjusted(tried: Readout) -> tuple[float, Array]:
         found = bundle
         for _ in range(_ROUNDS - 1 if any(tried) else 1):
             found = rolling.rectified(found, xy, pinhole, tried)
-            adjusted = adjust_bundle(found.select(~held), pinhole).bundle
-            found = replace(found, cam_from_world=adjusted.cam_from_world, points=adjusted.points)
+            kept = adjust_bundle(found.select(~held), pinhole).bundle
+            found = replace(found, cam_from_world=kept.cam_from_world, points=kept.points)
         errors = rolling.rectified(found, xy, pinhole, tried).select(held).reprojection_errors(pinhole)
-        costs.append(robust_cost(errors))
-        depths.append(np.maximum(found.points_in_cam()[:, 2], 1e-9))
+        return robust_cost(errors), np.maximum(found.points_in_cam()[:, 2], 1e-9)
+
+    costs, depths = zip(*parallel_map(adjusted, (NO_READOUT, readout), get_threads()), strict=True)
     change = np.log(depths[1] / depths[0])
     by_camera = np.array([np.median(change[bundle.obs_cam == c]) for c in np.unique(bundle.obs_cam)])
     low, high = np.percentile(by_camera, (2, 98))
