@@ -197,20 +197,20 @@ def verify_matches(
         return None
     matrices = np.stack([_matrix(m) for m in (geometry.F, geometry.E, geometry.H)])
     if len(shown) < len(matches):
-        inliers = matches[_obey(geometry.config, matrices, xy[0][matches[:, 0]], xy[1][matches[:, 1]], camera)]
+        inliers = matches[_obey(int(geometry.config), matrices, xy[0][matches[:, 0]], xy[1][matches[:, 1]], camera)]
     return VerifiedPair(*pair, inliers, int(geometry.config), matrices)
 
 
 def _obey(
-    config: pycolmap.TwoViewGeometryConfiguration, matrices: NDArray[np.float64], first: NDArray[np.float64],
-    second: NDArray[np.float64], camera: pycolmap.Camera,
+    config: int, matrices: NDArray[np.float64], first: NDArray[np.float64], second: NDArray[np.float64],
+    camera: pycolmap.Camera,
 ) -> NDArray[np.bool_]:  # fmt: skip
     """(M,) which matched pixels (M, 2) obey the geometry as pycolmap judges that: F, E or H (3, 3, 3)."""
     kinds = pycolmap.TwoViewGeometryConfiguration
-    if config == kinds.CALIBRATED:
-        first, second = camera.cam_from_img(first), camera.cam_from_img(second)
+    if config == int(kinds.CALIBRATED):
+        first, second = (np.asarray(camera.cam_from_img(pixels)) for pixels in (first, second))
         limit, matrix = camera.cam_from_img_threshold(_MAX_ERROR), matrices[1]
-    elif config == kinds.UNCALIBRATED:
+    elif config == int(kinds.UNCALIBRATED):
         limit, matrix = _MAX_ERROR, matrices[0]
     else:
         moved = np.column_stack([first, np.ones(len(first))]) @ matrices[2].T
