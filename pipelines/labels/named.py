@@ -101,6 +101,7 @@ class NamedScene:
         share = _agreed(by_shape, patch)
         if probabilities_of is not None:
             shape, share = share, _agreed(votes, patch)
+            share /= np.maximum(share.sum(1, keepdims=True), 1e-9)  # what is left out leaves little to the others
             recognise(share, vocabulary.names, shape)
         one_name_each(share, vocabulary.names, voxels)
         columns, names, kept = _settle(share, voxels, vocabulary, elsewhere)
