@@ -25,7 +25,7 @@ from ..types import Frame
 PICKED, LOSSLESS = "picked", "lossless"
 """Folders of the snapshot."""
 _TRACKED_SIDE = 480
-_MAX_CORNERS = 300
+_MAX_CORNERS = 600
 _MIN_TRACKS = 30
 _APART_PX = 6.0
 _LEVELS = 4
