@@ -11,12 +11,13 @@ from proxy_room import UNIT, Room
 from msgs_slam.pipelines.evaluation.labels import count_labels, score
 from msgs_slam.pipelines.geometry import voxels
 from msgs_slam.pipelines.geometry.sequence import resample_linear
-from msgs_slam.pipelines.geometry.voxels import Gravity, Voxels, merge, voxel_keys
+from msgs_slam.pipelines.geometry.voxels import FLOOR, OTHER, Gravity, Voxels, merge, voxel_keys
 from msgs_slam.pipelines.labels.named import (
     NamedScene,
     NetworkClasses,
     ShapeLabels,
     disputed,
+    name_likelihood,
     one_name_each,
     recognise,
 )
@@ -129,6 +130,20 @@ def voxels_of(positions: list[tuple[float, float, float]], normals: list[tuple[f
     order = np.argsort(keys)
     normal = np.array(normals, float)
     return Voxels(1.0, keys[order], np.ones(len(keys)), points[order], normal[order], np.zeros((len(keys), 3)))
+
+
+def test_floors_lie_and_walls_stand() -> None:
+    names = ("floor", "wall", "ceiling", "chair")
+    voxels = voxels_of([(0, 0, 0), (1, 0, 5), (2, 0, 9)], [(0, 0, 1), (1, 0, 0), (0, 0, -1)])
+    likely = name_likelihood(names, voxels, UP, np.array([FLOOR, OTHER, OTHER]), 5.0)
+    assert (likely[:, 0] == [1, likely[1, 0], likely[2, 0]]).all()
+    assert likely[1, 0] < 0.2
+    assert likely[0, 1] < 0.2
+    assert likely[1, 1] == 1
+    assert likely[0, 2] < 0.2
+    assert likely[2, 2] == 1
+    assert (likely[1:, 3] == 1).all()
+    assert (name_likelihood(names, voxels, Gravity(UP.up, False), np.zeros(3, np.int64), 5.0) == 1).all()
 
 
 def test_shape_names_what_a_network_takes_for_a_wall_and_nothing_else() -> None:

@@ -93,7 +93,7 @@ def test_frames_of_a_stand_in_name_the_made_room_together(room: Room, tmp_path: 
 
 
 def test_nothing_is_called_a_person_where_people_are_left_out(room: Room, tmp_path: Path) -> None:
-    weight = [[3.0, -1.0, -1.0], [-1.0, 3.0, 0.0], [-1.0, 0.0, 3.0]]
+    weight = [[8.0, -4.0, -4.0], [-4.0, 8.0, -4.0], [-4.0, -4.0, 8.0]]
     file = write_tflite(tmp_path / "net.tflite", weight, [0, 0, 0], "argmax", (96, 128))
     card = Card(
         "segmentation", file, "image", "scores", 1.0, (0.5,) * 3, (0.5,) * 3, kind="logits",
