@@ -246,6 +246,10 @@ _BEYOND_SHARE = 0.03
 """Behind a wall, under a floor, over a ceiling there is at most this share of the surface."""
 
 
+_LEANING = 0.03
+"""How much the cameras' up counts beside walls that are all of the surface; a third and three times that do as well."""
+
+
 @dataclass(frozen=True)
 class Gravity:
     """up (3,) unit vector in the world; `is_sure` when a dominant plane confirms the cameras' own up."""
@@ -256,13 +260,13 @@ class Gravity:
 
 def find_gravity(voxels: Voxels, cam_up: NDArray[np.float64]) -> Gravity:
     """Find up: the normal direction of the most surface within 40° of the cameras' mean up `cam_up` (people hold
-    cameras upright). Opposite normals (floor and ceiling) count as the same direction. Without any surface there, the
-    cameras' up, unsure."""
+    cameras upright). Opposite normals (floor and ceiling) count as the same direction. Without much surface there:
+    what the walls stand along, or the cameras' up, unsure."""
     cam_up = cam_up / max(float(np.linalg.norm(cam_up)), 1e-12)
     along = voxels.normal @ cam_up
     near = np.abs(along) > np.cos(np.radians(40))
     if voxels.weight[near].sum() <= 0.03 * voxels.weight.sum():
-        return Gravity(cam_up, False)
+        return Gravity(_along_walls(voxels, cam_up), False)
     normals = voxels.normal[near] * np.sign(along[near])[:, None]
     weight = voxels.weight[near]
     up = normals[int(_support(normals, weight).argmax())]
@@ -271,7 +275,17 @@ def find_gravity(voxels: Voxels, cam_up: NDArray[np.float64]) -> Gravity:
         up = (normals[close] * weight[close, None]).sum(0)
         up = up / np.linalg.norm(up)
     share = weight[normals @ up > np.cos(np.radians(8))].sum() / voxels.weight.sum()
-    return Gravity(up, bool(share > 2 * _MIN_SHARE))
+    return Gravity(up, True) if share > 2 * _MIN_SHARE else Gravity(_along_walls(voxels, cam_up), False)
+
+
+def _along_walls(voxels: Voxels, up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The direction across the normals of what stands, near `up`, which decides where all walls face one way."""
+    for degrees in (40, 30, 20):
+        weight = voxels.weight * (np.abs(voxels.normal @ up) < np.sin(np.radians(degrees)))
+        spread = (voxels.normal.T * weight) @ voxels.normal / max(float(voxels.weight.sum()), 1e-12)
+        up = np.linalg.solve(spread + _LEANING * np.eye(3), _LEANING * up)
+        up = up / max(float(np.linalg.norm(up)), 1e-12)
+    return np.asarray(up)
 
 
 def _support(normals: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -88,6 +88,21 @@ def test_a_missing_voxel_is_answered_by_one_that_touches_it(missing: int) -> Non
         assert (found.ravel()[8:] >= 0).sum() > voxels._BLOCK // 27
 
 
+@pytest.mark.parametrize(("walls", "within"), [(2, 2.0), (1, 12.0)])
+def test_where_no_floor_is_seen_walls_say_what_is_up(walls: int, within: float) -> None:
+    """Cameras that look down by 25 degrees; one wall leaves open how far they lean along it."""
+    normals = np.eye(3)[[0, 2]][:walls]
+    points = np.arange(600.0).reshape(200, 3)
+    normal = np.repeat(normals, 200 // walls, axis=0) + 0.05 * np.random.default_rng(0).normal(size=(200, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    columns = np.hstack([np.ones((200, 1)), points, normal, points])
+    room = voxels.merge(1.0, [(voxels.voxel_keys(points, 1.0), columns)])
+    leaning = np.array([np.sin(0.3), np.cos(0.44), np.sin(0.3 if walls == 2 else 0.1)])
+    found = find_gravity(room, leaning)
+    assert not found.is_sure
+    assert 0 < np.degrees(np.arccos(found.up[1])) < within
+
+
 @pytest.mark.parametrize("count", [0, 1, 2])
 @pytest.mark.parametrize("slant", [(0.0, 1.0, 0.0), (1.0, 0.0, 0.0)])
 @pytest.mark.parametrize("cam_up", [(0.0, 2.0, 0.0), (0.0, 0.0, 0.0)])
