@@ -197,25 +197,26 @@ def verify_matches(
         return None
     matrices = np.stack([_matrix(m) for m in (geometry.F, geometry.E, geometry.H)])
     if len(shown) < len(matches):
-        inliers = matches[_obey(int(geometry.config), matrices, xy[0][matches[:, 0]], xy[1][matches[:, 1]], camera)]
+        inliers = matches[_obey(matrices, xy[0][matches[:, 0]], xy[1][matches[:, 1]], camera)]
     return VerifiedPair(*pair, inliers, int(geometry.config), matrices)
 
 
 def _obey(
-    config: int, matrices: NDArray[np.float64], first: NDArray[np.float64], second: NDArray[np.float64],
-    camera: pycolmap.Camera,
-) -> NDArray[np.bool_]:  # fmt: skip
-    """(M,) which matched pixels (M, 2) obey the geometry as pycolmap judges that: F, E or H (3, 3, 3)."""
-    kinds = pycolmap.TwoViewGeometryConfiguration
-    if config == int(kinds.CALIBRATED):
-        first, second = (np.asarray(camera.cam_from_img(pixels)) for pixels in (first, second))
-        limit, matrix = camera.cam_from_img_threshold(_MAX_ERROR), matrices[1]
-    elif config == int(kinds.UNCALIBRATED):
-        limit, matrix = _MAX_ERROR, matrices[0]
-    else:
-        moved = np.column_stack([first, np.ones(len(first))]) @ matrices[2].T
-        return np.asarray(np.linalg.norm(moved[:, :2] / moved[:, 2:] - second, axis=1) <= _MAX_ERROR)
-    return np.asarray(pycolmap.compute_squared_sampson_error(first, second, matrix)) <= limit**2
+    matrices: NDArray[np.float64], first: NDArray[np.float64], second: NDArray[np.float64], camera: pycolmap.Camera
+) -> NDArray[np.bool_]:
+    """(M,) which matched pixels (M, 2) obey that of the geometries F, E and H (3, 3, 3) that most of them obey.
+
+    As pycolmap chooses: where a plane or a turn explains most, the others' parallax is what E is known by.
+    """
+    rays = [np.asarray(camera.cam_from_img(pixels)) for pixels in (first, second)]
+    moved = np.column_stack([first, np.ones(len(first))]) @ matrices[2].T
+    errors = np.stack([
+        np.sqrt(pycolmap.compute_squared_sampson_error(*rays, matrices[1])) / camera.cam_from_img_threshold(1.0),
+        np.sqrt(pycolmap.compute_squared_sampson_error(first, second, matrices[0])),
+        np.linalg.norm(moved[:, :2] / moved[:, 2:] - second, axis=1),
+    ])  # fmt: skip
+    obey = (errors <= _MAX_ERROR) & matrices[[1, 0, 2]].any(axis=(1, 2))[:, None]
+    return obey[obey.sum(axis=1).argmax()]
 
 
 def _may_agree(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
