@@ -24,9 +24,6 @@ _BELOW_ALL = -(2**24)
 """Below all products of descriptors, which are whole numbers that a float has exactly."""
 _ROWS = 512
 """Of the table of all products: with as many columns as an image has features they stay in the cache."""
-_SHOWN = 400
-"""Matches by which the geometry of two keyframes is found, which then decides on the others: with all of a thousand
-that takes 20 to 35 milliseconds, with these 5, for the same matches but one in a hundred."""
 _FIRST_TRIALS, _NEARLY = 300, 0.8
 """Trials of the first look at a pair, and its share of the least inliers: chosen on two recordings."""
 
@@ -186,37 +183,16 @@ def verify_matches(
     seed: int,
 ) -> VerifiedPair | None:
     """Robust two-view geometry of proposed matches, or None. See `match_pair`."""
-    shown = matches[np.linspace(0, len(matches), min(len(matches), _SHOWN), endpoint=False).astype(np.int64)]
-    if not _may_agree(xy[0][shown[:, 0]], xy[1][shown[:, 1]]):
+    if not _may_agree(xy[0][matches[:, 0]], xy[1][matches[:, 1]]):
         return None
     pair_seed = int(np.random.SeedSequence([seed, *pair]).generate_state(1)[0] & 0x7FFFFFFF)
     options = _verification_options(pair_seed)
-    geometry = pycolmap.estimate_two_view_geometry(camera, xy[0], camera, xy[1], shown, options)
+    geometry = pycolmap.estimate_two_view_geometry(camera, xy[0], camera, xy[1], matches, options)
     inliers = np.asarray(geometry.inlier_matches, dtype=np.uint32).reshape(-1, 2)
     if len(inliers) < MIN_INLIERS:
         return None
     matrices = np.stack([_matrix(m) for m in (geometry.F, geometry.E, geometry.H)])
-    if len(shown) < len(matches):
-        inliers = matches[_obey(matrices, xy[0][matches[:, 0]], xy[1][matches[:, 1]], camera)]
     return VerifiedPair(*pair, inliers, int(geometry.config), matrices)
-
-
-def _obey(
-    matrices: NDArray[np.float64], first: NDArray[np.float64], second: NDArray[np.float64], camera: pycolmap.Camera
-) -> NDArray[np.bool_]:
-    """(M,) which matched pixels (M, 2) obey that of the geometries F, E and H (3, 3, 3) that most of them obey.
-
-    As pycolmap chooses: where a plane or a turn explains most, the others' parallax is what E is known by.
-    """
-    rays = [np.asarray(camera.cam_from_img(pixels)) for pixels in (first, second)]
-    moved = np.column_stack([first, np.ones(len(first))]) @ matrices[2].T
-    errors = np.stack([
-        np.sqrt(pycolmap.compute_squared_sampson_error(*rays, matrices[1])) / camera.cam_from_img_threshold(1.0),
-        np.sqrt(pycolmap.compute_squared_sampson_error(first, second, matrices[0])),
-        np.linalg.norm(moved[:, :2] / moved[:, 2:] - second, axis=1),
-    ])  # fmt: skip
-    obey = (errors <= _MAX_ERROR) & matrices[[1, 0, 2]].any(axis=(1, 2))[:, None]
-    return obey[obey.sum(axis=1).argmax()]
 
 
 def _may_agree(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:

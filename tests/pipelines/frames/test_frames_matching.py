@@ -122,34 +122,6 @@ def test_verification_drops_outliers_and_depends_on_the_seed_and_the_pair_alone(
     np.testing.assert_array_equal(again.matrices, found.matrices)
 
 
-@pytest.mark.parametrize("kind", ["CALIBRATED", "UNCALIBRATED", "turn", "wall"])
-def test_a_part_of_the_matches_decides_as_all_do(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    first, second, _, pose = _two_views(0.3)
-    camera = pycolmap.Camera(CAMERA.todict() | {"has_prior_focal_length": kind in ("CALIBRATED", "wall")})
-    if kind == "turn":
-        rays = np.column_stack([camera.cam_from_img(first), np.ones(len(first))]) @ pose[:, :3].T
-        second = camera.img_from_cam(rays)
-    if kind == "wall":  # with a seventh of the points before it, which the homography does not explain
-        rng = np.random.default_rng(5)
-        points = rng.uniform([-1, -0.8, 4], [1, 0.8, 4], (200, 3))
-        points[3::7, 2] = rng.uniform(2, 3, len(points[3::7]))
-        first, second = camera.img_from_cam(points), camera.img_from_cam(points @ pose[:, :3].T + pose[:, 3])
-    matches = np.stack([np.arange(200), np.arange(200)], axis=1).astype(np.uint32)
-    matches[::10, 1] = np.roll(matches[::10, 1], 1)
-    whole = verify_matches((0, 1), matches, (first, second), camera, seed=3)
-    assert whole is not None
-    places = first[matches[:, 0]], second[matches[:, 1]]
-    assert kind in (pycolmap.TwoViewGeometryConfiguration(whole.config).name, "turn", "wall")
-    decided = matches[matching._obey(whole.matrices, *places, camera)]
-    assert len({*map(tuple, decided)} ^ {*map(tuple, whole.matches)}) <= 4  # at the very limit
-    monkeypatch.setattr(matching, "_SHOWN", 100)
-    by_part = verify_matches((0, 1), matches, (first, second), camera, seed=3)
-    assert by_part is not None
-    assert by_part.config == whole.config
-    assert len({*map(tuple, by_part.matches)} ^ {*map(tuple, whole.matches)}) < 0.05 * len(matches)
-    assert len(by_part.matches) > (170 if kind == "wall" else 100)
-
-
 def test_unrelated_points_are_not_verified() -> None:
     rng = np.random.default_rng(0)
     xy = rng.uniform([0, 0], [WIDTH, HEIGHT], (2, 40, 2))
