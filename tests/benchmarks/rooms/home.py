@@ -1,14 +1,14 @@
 """A home by seed: three to six rooms joined by open doors, mostly along a corridor, some by a stair."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from .furniture import Catalogue
 from .room import Room, fill_room, make_trim, surface, thing_material
 from .surfaces import THICK, Array, Opening, Surfaces, frame_of
-from .textures import Random
+from .textures import Random, picture
 
 _LANDING, _RUN, _RISE = 1.0, 0.26, 0.18
 _TRIES = 300
@@ -53,7 +53,7 @@ def build_home(seed: int, catalogue: Catalogue) -> tuple[Home, Random]:
     """The home of a seed, and the source of chance for what follows."""
     r = np.random.default_rng(seed)
     places = plan(r)
-    home = Home(places, [], Surfaces())
+    home = Home(places, [], Surfaces(worn=True))
     trim, paint = None, None
     for number, place in enumerate(places):
         s = home.surfaces
@@ -61,7 +61,7 @@ def build_home(seed: int, catalogue: Catalogue) -> tuple[Home, Random]:
         room = Room(place.kind, place.size, s, catalogue, place.doors)
         trim = trim or make_trim(room, r)
         paint = surface(s, r, "wall") if paint is None else paint
-        room.trim, room.paint = trim, paint if r.random() < 0.6 else None
+        room.trim, room.paint = replace(trim, sky=_outside(room, trim.sky, seed)), paint if r.random() < 0.6 else None
         room.is_outside = lambda wall, hole, n=number: _is_outside(places, n, wall, hole)
         if place.kind == "stairs":
             _build_steps(room, r)
@@ -69,6 +69,15 @@ def build_home(seed: int, catalogue: Catalogue) -> tuple[Home, Random]:
         fill_room(room, r)
         home.rooms.append(room)
     return home, r
+
+
+def _outside(room: Room, sky: int, seed: int) -> int:
+    """What is outside of a room's windows: no other room shows the same picture."""
+    s, (x, _, z) = room.surfaces, np.abs(room.surfaces.place[:3, 3] * 1000).astype(np.int64).tolist()
+    if s.materials[sky].texture < 0:
+        return sky
+    r = np.random.default_rng([seed, x, z])
+    return s.material((1, 1, 1), picture(r, room.catalogue.textures), emission=s.materials[sky].emission)
 
 
 # the plan -------------------------------------------------------------------------------------------------------

@@ -19,6 +19,8 @@ _LONGEST_EDGE = 0.3
 _SUB = np.array([[0, 0], [-0.33, 0.17], [0.25, -0.33], [0.3, 0.33]])
 """Places of the rays in a pixel."""
 _LEVELS = 9
+_WEAR = np.array([0.008, 0.032, 0.13], np.float32)
+"""Metres between the places of a worn wall's three sizes of unevenness."""
 Array = NDArray[np.float32]
 
 
@@ -48,6 +50,7 @@ class LitRoom:
         self.rgb = np.array([m.rgb for m in surfaces.materials], np.float32)
         self.emission = np.array([m.emission for m in surfaces.materials], np.float32)
         self.gloss = np.array([m.gloss for m in surfaces.materials], np.float32)
+        self.wear = np.array([m.wear for m in surfaces.materials], np.float32)
         self.lights = surfaces.lights
         if lit:
             self._store_textures(surfaces)
@@ -131,7 +134,8 @@ class LitRoom:
         u, v, t = (np.ascontiguousarray(hit[k], np.float32) for k in ("u", "v", "tfar"))
         _shade(
             np.ascontiguousarray(hit["primID"], np.int32), u, v, t, ways, self.flat, self.places, self.light,
-            self.material, self.rgb, self.texture, self.emission, self.density, self.texels, self.offsets, focal, out,
+            self.material, self.rgb, self.texture, self.emission, self.density, self.texels, self.offsets, focal,
+            self.points, self.wear, out,
         )  # fmt: skip
         return out
 
@@ -322,8 +326,44 @@ def _fetch(texels: Array, start: int, side: int, u: float, v: float, out: Array)
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _unevenness(at: Array) -> float:
+    """Smooth chance in -1..1 by place (3,), the same nowhere else."""
+    x, y, z = math.floor(at[0]), math.floor(at[1]), math.floor(at[2])
+    fx, fy, fz = at[0] - x, at[1] - y, at[2] - z
+    fx, fy, fz = fx * fx * (3 - 2 * fx), fy * fy * (3 - 2 * fy), fz * fz * (3 - 2 * fz)
+    total = 0.0
+    for corner in range(8):
+        i, j, k = corner & 1, (corner >> 1) & 1, corner >> 2
+        h = np.uint32((x + i) * 73856093 ^ (y + j) * 19349663 ^ (z + k) * 83492791)
+        h = np.uint32((h ^ (h >> np.uint32(16))) * np.uint32(0x45D9F3B))
+        h = np.uint32((h ^ (h >> np.uint32(16))) * np.uint32(0x45D9F3B))
+        h ^= h >> np.uint32(16)
+        weight = (fx if i else 1 - fx) * (fy if j else 1 - fy) * (fz if k else 1 - fz)
+        total += weight * (np.float64(h) / 2147483648.0 - 1)
+    return total
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _shade(
-    prim, bu, bv, far, ways, flat, places, light, material, rgb, texture, emission, density, texels, offsets, focal, out
+    prim,
+    bu,
+    bv,
+    far,
+    ways,
+    flat,
+    places,
+    light,
+    material,
+    rgb,
+    texture,
+    emission,
+    density,
+    texels,
+    offsets,
+    focal,
+    points,
+    wear,
+    out,
 ):  # type: ignore[no-untyped-def]
     """Colour (N, 3) of what rays hit: texture or colour times the light on that side, and what it gives off."""
     fine, coarse = np.zeros(3, np.float32), np.zeros(3, np.float32)
@@ -345,9 +385,15 @@ def _shade(
             high = min(low + 1, 8)
             _fetch(texels, offsets[k, low], 256 >> low, u, v, fine)
             _fetch(texels, offsets[k, high], 256 >> high, u, v, coarse)
+        worn = 1.0
+        if wear[m] > 0:
+            foot = far[i] / focal / math.sqrt(max(abs(facing), 0.05))
+            at = points[p, 0] * c + points[p, 1] * a + points[p, 2] * b
+            for size in _WEAR:
+                worn += wear[m] * min(max(size / (2 * foot) - 0.5, 0.0), 1.0) * _unevenness(at / size)
         for n in range(3):
             tone = rgb[m, n]
             if k >= 0:
-                tone = fine[n] + (level - low) * (coarse[n] - fine[n])
+                tone = (fine[n] + (level - low) * (coarse[n] - fine[n])) * worn
             lit = light[side, p, 0, n] * c + light[side, p, 1, n] * a + light[side, p, 2, n] * b
             out[i, n] = min(tone * (lit + emission[m, n]), 4.0)

@@ -90,7 +90,8 @@ def surface(s: Surfaces, r: Random, kind: str) -> int:
     if texture is None:
         return s.material(linear(rgb * 255), gloss=gloss)
     image, span = texture(r, rgb)
-    return s.material((1, 1, 1), image, span, gloss=gloss)
+    spread = float((image.std((0, 1)) / image.mean((0, 1))).mean())
+    return s.material((1, 1, 1), image, span, gloss=gloss, wear=float(np.clip(spread, 0.008, 0.04)) if s.worn else 0.0)
 
 
 def thing_material(s: Surfaces, r: Random, wooden: float = 0.4) -> int:

@@ -22,14 +22,15 @@ THICK = 0.14
 
 @dataclass(frozen=True)
 class Material:
-    """Linear colour (3,), number of its texture (-1: none), metres that this spans, light that it gives off (3,), and
-    how much of what is mirrored in it it shows."""
+    """Linear colour (3,), number of its texture (-1: none), metres that this spans, light that it gives off (3,), how
+    much of what is mirrored in it it shows, and by what share it is lighter and darker from place to place."""
 
     rgb: NDArray[np.float32]
     texture: int
     size: float
     emission: NDArray[np.float32]
     gloss: float
+    wear: float
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,11 @@ class Opening:
 
 class Surfaces:
     """Triangles with materials, classes and numbers of things, and the rectangles that give light. What is added stands
-    in the frame `place` (4, 4)."""
+    in the frame `place` (4, 4). Where walls and floors are `worn`, their textures look the same nowhere: those that
+    repeat in whole rooms are recognised where nobody has been."""
 
-    def __init__(self) -> None:
+    def __init__(self, worn: bool = False) -> None:
+        self.worn = worn
         self.place = np.eye(4)
         self.parts: list[tuple[NDArray[np.float32], ...]] = []
         self.materials: list[Material] = []
@@ -63,6 +66,7 @@ class Surfaces:
         size: float = 1.0,
         emission: NDArray | tuple[float, ...] = (0, 0, 0),
         gloss: float = 0.0,
+        wear: float = 0.0,
     ) -> int:
         """Number of a new material."""
         number = -1
@@ -70,7 +74,7 @@ class Surfaces:
             number = len(self.textures)
             self.textures.append(texture)
         light = np.asarray(emission, np.float32)
-        self.materials.append(Material(np.asarray(rgb, np.float32), number, size, light, gloss))
+        self.materials.append(Material(np.asarray(rgb, np.float32), number, size, light, gloss, wear))
         return len(self.materials) - 1
 
     def of_class(self, name: str) -> None:
