@@ -33,7 +33,7 @@ from .consistency import (
 from .given import posed_model
 from .lens import FOCAL_GUESS, unknown_camera
 from .matching import VerifiedPair, write_database
-from .rolling import NO_READOUT, Readout, adjust_rolling, read_readout, straight_copy
+from .rolling import FILM, NO_READOUT, Readout, adjust_rolling, read_readout, straight_copy
 from .snapshots import Snapshots
 from .two_views import calibrated
 
@@ -218,7 +218,8 @@ class CandidateModels:
             found = self._build_model(name, views, pairs, pairs)
             if found is not None and (name == GIVEN or (found[2].is_consistent and not found[2].is_whole)):
                 found = self._register_remaining(found, views, pairs, pairs)
-            unfolded = None if found is None or not found[2].contradicted else self._remap_from_neighbours(views, pairs)
+            folded = found is not None and (found[2].contradicted or found[2].leaps)
+            unfolded = self._remap_from_neighbours(views, pairs) if folded else None
             # Of two alike the one before, but the given poses are evidence that no match is.
             best = max(filter(None, (best, found, unfolded)), key=_selection_score, default=None)
         if best is None or best[2].registered < min(_MIN_KEYFRAMES, best[2].total) or best[2].points < _MIN_POINTS:
@@ -258,7 +259,7 @@ class CandidateModels:
         model = self.snapshots.model(name, lambda work: self._run_mapper(name, work, views, pairs, start))
         if model is None:
             return None
-        return model, name, judge(model, every, views.xy, self._places(views.xy), self.config.overlap)
+        return model, name, judge(model, every, views.xy, *self._range(views))
 
     def _run_mapper(
         self,
@@ -284,6 +285,11 @@ class CandidateModels:
             return map_incrementally(database, work, not self.is_fixed, self.seed)
         tracks = _TRACKS_IN_A_CHAIN if name == NEIGHBOURS else _TRACKS
         return map_globally(database, work, not self.is_fixed, self.seed, tracks)
+
+    def _range(self, views: KeyframeSet) -> tuple[int, int, NDArray[np.float64] | None]:
+        """How many places there are, how far a neighbour is, and the times of a film: see `judge`."""
+        places = self._places(views.xy)
+        return places, self.config.overlap, views.times[:places] if 0 < self.frame_interval < FILM else None
 
     def _places(self, views: Sequence[object]) -> int:
         return len(views) // len(self.cam_from_rig)

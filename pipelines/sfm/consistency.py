@@ -6,9 +6,8 @@ after it.
 """
 
 from collections import defaultdict
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 import pycolmap
@@ -20,6 +19,7 @@ from .components import (
     PairCheck,
     Seam,
     find_components,
+    find_leaps,
     find_seams,
     tracks_of,
     worst_contradictions,
@@ -68,7 +68,8 @@ class ModelReport:
     `agreement`: share of the verified matches between registered keyframes that are within 4 px of the epipolar line
     of the final poses; `pairs_agreeing`: share of the pairs of which more than half of the matches do. A folded
     trajectory leaves whole pairs that disagree, however small its reprojection error is. `seams` and `components`: see
-    `find_seams` and `find_components`; they see one bad place among many good ones. `drift`: see `scale_drift`.
+    `find_seams` and `find_components`; they see one bad place among many good ones. `drift`: see `scale_drift`;
+    `leaps`: keyframes before which a film's camera would have to leap.
     """
 
     registered: int
@@ -80,6 +81,7 @@ class ModelReport:
     seams: tuple[Seam, ...]
     components: tuple[tuple[int, ...], ...]
     drift: ScaleDrift = NO_DRIFT
+    leaps: tuple[int, ...] = ()
 
     @property
     def largest(self) -> tuple[int, ...]:
@@ -94,9 +96,7 @@ class ModelReport:
     @property
     def score(self) -> float:
         """To choose between models of the same matches: larger is better."""
-        cuts = [s.after for s in self.contradicted]
-        runs = [sum(1 for k in self.largest if a <= k < b) for a, b in pairwise([0, *cuts, self.total])]
-        return max(runs) / self.total * self.agreement * self.pairs_agreeing / self.drift.factor
+        return len(self.largest) / self.total * self.agreement * self.pairs_agreeing / self.drift.factor
 
     @property
     def is_whole(self) -> bool:
@@ -120,27 +120,35 @@ def judge(
     xy: Sequence[NDArray[np.float64]],
     total: int,
     reach: int,
-    breaks: Container[int] = (),
+    times: Array | None = None,
+    breaks: Collection[int] = (),
     straight: Sequence[Array] | None = None,
 ) -> ModelReport:
     """Report on a model; `pairs` are indices i of keyframes whose image id is i + 1, `xy` their features' pixels.
 
     total: number of stations; keyframes i, i + total and so on are views from one place in several
-    directions, and the report is about places. `reach`: places at most so many apart are neighbours. `breaks`: places
-    before which the seam counts as without a point. `straight`: pixels in frames taken at once, by which the drift of
-    each component is measured, and not that of all.
+    directions, and the report is about places. `reach`: places at most so many apart are neighbours. `times` (total,)
+    of a film in seconds. `breaks`: places before which, as where the camera leaps or neighbours
+    contradict the path, the seam counts as without a point.
+    `straight`: pixels in frames taken at once, by which the drift of each component is measured, and not that of all.
     """
     checks = check_pairs(model, pairs, xy, total)
     matches, agreeing = sum(c.matches for c in checks), sum(c.agreeing for c in checks)
-    placed, tracks = sorted({(i - 1) % total for i in model.reg_image_ids()}), tracks_of(model, total)
-    seams = [replace(s, points=0) if s.after in breaks else s for s in find_seams(placed, checks, tracks, reach)]
-    components = find_components(placed, seams, tracks, reach)
+    views = {(i - 1) % total: model.images[i] for i in sorted(model.reg_image_ids())}
+    placed, tracks = sorted(views), tracks_of(model, total)
+    centers = np.array([views[k].projection_center() for k in placed]).reshape(-1, 3)
+    leaps = [] if times is None else [placed[n] for n in find_leaps(centers, times[placed])]
+    seams = find_seams(placed, checks, tracks, reach)
+    breaks = {*breaks, *leaps, *(s.after for s in worst_contradictions(seams))}
+    seams = [replace(s, points=0) if s.after in breaks else s for s in seams]
+    components = find_components(placed, seams, tracks, reach, breaks)
     parts, seen = ([placed], xy) if straight is None else (components, straight)
     drifts = (scale_drift(model, pairs, seen, total, reach, part) for part in parts)
     return ModelReport(
         len(placed), total, model.num_points3D(), median_error(model),
         agreeing / max(matches, 1), sum(c.agrees for c in checks) / max(len(checks), 1),
         tuple(seams), tuple(map(tuple, components)), max(drifts, key=lambda d: d.factor, default=NO_DRIFT),
+        tuple(leaps),
     )  # fmt: skip
 
 

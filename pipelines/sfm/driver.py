@@ -119,7 +119,7 @@ class StructureFromMotion(CandidateModels):
     ) -> tuple[ModelReport, list[int]]:
         """Report on a model, cut into components that share no point, also where the scale changes within one, and list
         the loose keyframes taken out of it."""
-        loose, breaks, range_of = list[int](), set[int](), (self._places(views.xy), self.config.overlap)
+        loose, breaks, range_of = list[int](), set[int](), self._range(views)
         straight = rectified_features(model, views.xy, views.times, readout)
         while True:
             report = judge(model, pairs, views.xy, *range_of, breaks, straight)
@@ -251,7 +251,7 @@ class StructureFromMotion(CandidateModels):
                 return pieces
             piece = found[0]
             adjust_model(piece, refine_camera=False)
-            report = judge(piece, rest, views.xy, self._places(views.xy), self.config.overlap)
+            report = judge(piece, rest, views.xy, *self._range(views))
             left -= {i - 1 for i in piece.reg_image_ids()}
             if self._is_piece(report):
                 remove_keyframes(piece, [k for component in report.components[1:] for k in component])

@@ -34,6 +34,8 @@ LONGEST_STEP = 1.0
 """Seconds: frames farther apart say nothing about the camera's velocity at either."""
 MIN_STEP = 1e-4
 """Seconds: frames of nearly one time (duplicated or repaired timestamps) make a derivative of noise alone."""
+FILM = 0.5
+"""Seconds from one image to the next: of photos taken more slowly the speed tells nothing."""
 MIN_GAIN = 0.01
 """Share of the robust cost that a readout must explain. Of three cameras that take all rows at once it was less than
 0.00002, of a phone that holds still 0.001; of a Kinect 0.03 at first and 0.054 in the end."""

@@ -15,6 +15,7 @@ from scipy.sparse import csr_matrix
 
 from ..geometry import se3
 from ..geometry.se3 import Similarity
+from ..sfm.components import find_leaps
 from ..sfm.features import GlobalDescriptors, far_apart, loop_pairs
 from ..types import Array, LoopEdge
 from .pnp import MIN_INLIERS, group_by_points, localise_in_groups
@@ -61,12 +62,14 @@ class Link:
 
 @dataclass(frozen=True)
 class LinkSearch:
-    """Looks for links in `state`; `refused` are pairs of keyframes that structure from motion has matched in vain."""
+    """Looks for links in `state`; `refused` are pairs of keyframes that structure from motion has matched in vain,
+    `times` (F,) those of a film's frames in seconds."""
 
     state: TrackState
     pictures: Pictures
     seed: int
     refused: Collection[tuple[int, int]] = ()
+    times: Array | None = None
 
     def recognise(self, frame_id: int, keyframes: Iterable[int]) -> Link | None:
         """Return the link of a keyframe to others, if it has enough in common with them for a pose and a scale."""
@@ -139,7 +142,18 @@ class LinkSearch:
             if (link := self.recognise(ours[n], known)) is not None:
                 found.append(link)
         agreeing = max((self._agreeing(link, found) for link in found), key=len, default=[])
-        return agreeing if len(agreeing) > 1 else []
+        return agreeing if len(agreeing) > 1 and not self._leaps(segment, main, agreeing[0].move) else []
+
+    def _leaps(self, segment: int, main: int, move: Similarity) -> bool:
+        """Whether the camera of a film would leap between two segments, of which `move` takes the first to the other:
+        rooms look alike in more than one place."""
+        state = self.state
+        ids = np.array([i for i in sorted(state.poses) if state.segment[i] in (segment, main)])
+        moved = np.array([state.segment[i] == segment for i in ids.tolist()])
+        centers = se3.inverse(np.array([state.poses[i] for i in ids.tolist()]))[:, :3, 3]
+        centers[moved] = move.apply(centers[moved])
+        leaps = [] if self.times is None else find_leaps(centers, self.times[ids])
+        return any(moved[n - 1] != moved[n] for n in leaps)
 
     def loops(self, track: Callable[[list[_Asked]], Iterable[_Asked]]) -> list[Link]:
         """Return the links within segments that the path can have drifted by and that a second one supports; `track`

@@ -5,6 +5,7 @@ from copy import deepcopy
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...formats.errors import InputError
 from ..geometry.camera import rig_of
@@ -24,6 +25,7 @@ from ..run.files import (
 from ..run.stages import StageContext
 from ..sfm.adjust import FEATURE_SD
 from ..sfm.driver import LEAST_PIECE
+from ..sfm.rolling import FILM, frame_interval
 from ..system.machine import release_free_memory
 from ..system.progress import is_asked
 from ..system.values import load_value, save_value
@@ -102,7 +104,7 @@ class TrackingStage:
         any, or where they contradict what was known before."""
         context, intrinsics, before = self.context, self.pictures.intrinsics, deepcopy(state)
         refused = {pair for pair, matches in context.run.load(MATCHED_PAIRS).items() if matches == 0}
-        search = LinkSearch(state, self.pictures, self.config.run.seed, refused)
+        search = LinkSearch(state, self.pictures, self.config.run.seed, refused, self._film_times())
         joining = search.join_segments()
         loops: list[Link] = []
         if len(state.rig) == 1:  # the graph knows no places: loops of panoramas are those of structure from motion
@@ -124,6 +126,14 @@ class TrackingStage:
         self.links = []
         vars(state).update(vars(before))
         return None
+
+    def _film_times(self) -> NDArray[np.float64] | None:
+        """Seconds at which the frames (F,) of a film were taken; None of photos."""
+        frames = self.context.run.records.get("frames")
+        if frames is None or not frames.figures.get("timed", True):
+            return None
+        times, numbers = (np.array([getattr(f, name) for f in self.frames]) for name in ("timestamp", "source_index"))
+        return times if 0 < frame_interval(times, numbers) < FILM else None
 
     def _track_frames(self) -> TrackState:
         """Every frame visited once; goes on from the last snapshot."""

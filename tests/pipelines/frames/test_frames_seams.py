@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from msgs_slam.pipelines.sfm.components import (
     Seam,
     cut,
     find_components,
+    find_leaps,
     find_seams,
     remove_keyframes,
     tracks_of,
@@ -119,6 +121,52 @@ def test_a_loop_holds_two_runs_together() -> None:
         tracks = _tracks(25, loop)
         found = find_components(range(COUNT), find_seams(range(COUNT), _checks(0), tracks, REACH), tracks, REACH)
         assert [len(p) for p in found] == parts
+
+
+def test_no_loop_joins_what_a_break_parts() -> None:
+    """Three rooms; the path leaps from the second to the third, which is the first again."""
+    tracks = [t for t in _tracks(25) if not t[0] < 12 <= t[-1]] + [[2, 30]] * 110 + [[14, 35]] * 90
+    seams = find_seams(range(COUNT), _checks(0), tracks, REACH)
+
+    def sizes(breaks: tuple[int, ...], more: list[list[int]]) -> list[int]:
+        return [len(p) for p in find_components(range(COUNT), seams, [*tracks, *more], REACH, breaks)]
+
+    assert sizes((), []) == [COUNT]
+    assert sizes((25,), []) == sizes((25,), [[5, 20]] * 60) == [27, 13]
+    assert sizes((25,), [[5, 20]] * 120) == [25, 15]
+
+
+def test_a_keyframe_astray_does_not_part_what_is_around_it() -> None:
+    seams = find_seams(range(COUNT), _checks(0), _tracks(), REACH)
+    cut_around = [replace(s, points=0) if s.after in (20, 21) else s for s in seams]
+    found = find_components(range(COUNT), cut_around, _tracks(), REACH, (20, 21))
+    assert [len(p) for p in found] == [COUNT - 1, 1]
+    assert found[1] == [20]
+
+
+def test_a_path_leaps_where_no_camera_can_follow() -> None:
+    times = np.cumsum(np.random.default_rng(0).uniform(0.1, 1.0, COUNT))
+    centers = np.outer(times, [0.4, 0.0, 0.1]) * np.linspace(0.5, 1.5, COUNT)[:, None]
+    assert find_leaps(centers, times) == []
+    centers[25:] += 3
+    assert find_leaps(centers, times) == [25]
+    centers[10] += 2
+    assert find_leaps(centers, times) == [10, 11, 25]
+    assert find_leaps(centers[:1], times[:1]) == []
+
+
+def test_a_model_is_cut_where_its_camera_leaps(made_model: pycolmap.Reconstruction) -> None:
+    """Six keyframes and four more in a row with a long step between, though points are seen from both sides."""
+    for i in range(1, 11):
+        image = made_model.images[i]
+        turn = image.cam_from_world().rotation.matrix()
+        place = np.array([0.1 * i + 100 * (i > 6), 0.0, 0.0])
+        image.frame.rig_from_world = pycolmap.Rigid3d(np.column_stack([turn, -turn @ place]))
+    xy = [np.array([p.xy for p in made_model.images[i].points2D]) for i in range(1, 11)]
+    whole = judge(made_model, [], xy, 10, REACH)
+    parted = judge(made_model, [], xy, 10, REACH, np.arange(10.0))
+    assert (len(whole.largest), whole.leaps) == (10, ())
+    assert (parted.components, parted.leaps) == (((0, 1, 2, 3, 4, 5), (6, 7, 8, 9)), (6,))
 
 
 @pytest.fixture

@@ -226,6 +226,19 @@ def test_segments_are_joined_at_one_scale_wherever_they_recognise_each_other(siz
     assert (shared_points(state)[2:5, 36:39].toarray() > 20).any()
 
 
+def test_a_film_does_not_join_rooms_that_only_look_alike() -> None:
+    """The far side of the room is taken for the near one: the camera would leap from one keyframe to the next."""
+    for times, segments in ((None, {0}), (np.arange(40.0), {0, 1})):
+        search = replace(make_walk(twins=True).search(), times=times)
+        state = search.state
+        for k in range(40):
+            late = 17 <= k < 25
+            state.sightings[k] = state.sightings[k].select((state.sightings[k].point % 2400 >= 1200) == late)
+            state.segment[k] = int(late)
+        search.join_segments()
+        assert set(state.segment.values()) == segments
+
+
 def test_stretches_are_compared_again_only_with_what_has_joined_since(monkeypatch: pytest.MonkeyPatch) -> None:
     """Segment 2 is recognised at once, 3 only after 4; 5 joins 1, which nothing ties to the largest."""
     state, asked = TrackState(), []
