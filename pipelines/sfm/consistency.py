@@ -69,7 +69,7 @@ class ModelReport:
     of the final poses; `pairs_agreeing`: share of the pairs of which more than half of the matches do. A folded
     trajectory leaves whole pairs that disagree, however small its reprojection error is. `seams` and `components`: see
     `find_seams` and `find_components`; they see one bad place among many good ones. `drift`: see `scale_drift`;
-    `leaps`: keyframes before which a film's camera would have to leap.
+    `leaps`: keyframes before which a film's camera would have to leap, though images on both sides match.
     """
 
     registered: int
@@ -137,8 +137,10 @@ def judge(
     views = {(i - 1) % total: model.images[i] for i in sorted(model.reg_image_ids())}
     placed, tracks = sorted(views), tracks_of(model, total)
     centers = np.array([views[k].projection_center() for k in placed]).reshape(-1, 3)
-    leaps = [] if times is None else [placed[n] for n in find_leaps(centers, times[placed])]
     seams = find_seams(placed, checks, tracks, reach)
+    # Where nothing on one side matches the other, the film itself may have a cut.
+    fast = [] if times is None else [seams[n - 1] for n in find_leaps(centers, times[placed])]
+    leaps = [s.after for s in fast if s.pairs]
     breaks = {*breaks, *leaps, *(s.after for s in worst_contradictions(seams))}
     seams = [replace(s, points=0) if s.after in breaks else s for s in seams]
     components = find_components(placed, seams, tracks, reach, breaks)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,13 +63,14 @@ class Link:
 @dataclass(frozen=True)
 class LinkSearch:
     """Looks for links in `state`; `refused` are pairs of keyframes that structure from motion has matched in vain,
-    `times` (F,) those of a film's frames in seconds."""
+    `near` those that match and follow on each other in a film, `times` (F,) of its frames in seconds."""
 
     state: TrackState
     pictures: Pictures
     seed: int
     refused: Collection[tuple[int, int]] = ()
-    times: Array | None = None
+    near: Collection[tuple[int, int]] = ()
+    times: Array = field(default_factory=lambda: np.zeros(0))
 
     def recognise(self, frame_id: int, keyframes: Iterable[int]) -> Link | None:
         """Return the link of a keyframe to others, if it has enough in common with them for a pose and a scale."""
@@ -145,15 +146,17 @@ class LinkSearch:
         return agreeing if len(agreeing) > 1 and not self._leaps(segment, main, agreeing[0].move) else []
 
     def _leaps(self, segment: int, main: int, move: Similarity) -> bool:
-        """Whether the camera of a film would leap between two segments, of which `move` takes the first to the other:
-        rooms look alike in more than one place."""
+        """Whether the camera of a film would leap between two segments, of which `move` takes the first to the other,
+        where images on both sides match: rooms look alike in more than one place."""
+        if not self.near:
+            return False
         state = self.state
         ids = np.array([i for i in sorted(state.poses) if state.segment[i] in (segment, main)])
         moved = np.array([state.segment[i] == segment for i in ids.tolist()])
         centers = se3.inverse(np.array([state.poses[i] for i in ids.tolist()]))[:, :3, 3]
         centers[moved] = move.apply(centers[moved])
-        leaps = [] if self.times is None else find_leaps(centers, self.times[ids])
-        return any(moved[n - 1] != moved[n] for n in leaps)
+        leaps = [ids[n - 1 : n + 1] for n in find_leaps(centers, self.times[ids]) if moved[n - 1] != moved[n]]
+        return any(a <= before and after <= b for before, after in leaps for a, b in self.near)
 
     def loops(self, track: Callable[[list[_Asked]], Iterable[_Asked]]) -> list[Link]:
         """Return the links within segments that the path can have drifted by and that a second one supports; `track`

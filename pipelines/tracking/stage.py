@@ -103,8 +103,9 @@ class TrackingStage:
         """Join segments and close loops, in place, and adjust everything with the links that were found; None without
         any, or where they contradict what was known before."""
         context, intrinsics, before = self.context, self.pictures.intrinsics, deepcopy(state)
-        refused = {pair for pair, matches in context.run.load(MATCHED_PAIRS).items() if matches == 0}
-        search = LinkSearch(state, self.pictures, self.config.run.seed, refused, self._film_times())
+        pairs, times = context.run.load(MATCHED_PAIRS), np.array([f.timestamp for f in self.frames])
+        refused = {pair for pair, matches in pairs.items() if matches == 0}
+        search = LinkSearch(state, self.pictures, self.config.run.seed, refused, self._near(pairs, times), times)
         joining = search.join_segments()
         loops: list[Link] = []
         if len(state.rig) == 1:  # the graph knows no places: loops of panoramas are those of structure from motion
@@ -127,13 +128,14 @@ class TrackingStage:
         vars(state).update(vars(before))
         return None
 
-    def _film_times(self) -> NDArray[np.float64] | None:
-        """Seconds at which the frames (F,) of a film were taken; None of photos."""
-        frames = self.context.run.records.get("frames")
-        if frames is None or not frames.figures.get("timed", True):
-            return None
-        times, numbers = (np.array([getattr(f, name) for f in self.frames]) for name in ("timestamp", "source_index"))
-        return times if 0 < frame_interval(times, numbers) < FILM else None
+    def _near(self, pairs: dict[tuple[int, int], int], times: NDArray[np.float64]) -> list[tuple[int, int]]:
+        """Pairs of keyframes near each other that match; none of photos."""
+        frames, numbers = self.context.run.records.get("frames"), np.array([f.source_index for f in self.frames])
+        if frames is None or not frames.figures.get("timed", True) or not 0 < frame_interval(times, numbers) < FILM:
+            return []
+        place = {k: n for n, k in enumerate(sorted({k for pair in pairs for k in pair}))}
+        reach = self.config.frames.overlap
+        return [(i, j) for (i, j), matches in pairs.items() if matches and place[j] - place[i] <= reach]
 
     def _track_frames(self) -> TrackState:
         """Every frame visited once; goes on from the last snapshot."""

@@ -163,9 +163,11 @@ def test_a_model_is_cut_where_its_camera_leaps(made_model: pycolmap.Reconstructi
         place = np.array([0.1 * i + 100 * (i > 6), 0.0, 0.0])
         image.frame.rig_from_world = pycolmap.Rigid3d(np.column_stack([turn, -turn @ place]))
     xy = [np.array([p.xy for p in made_model.images[i].points2D]) for i in range(1, 11)]
-    whole = judge(made_model, [], xy, 10, REACH)
-    parted = judge(made_model, [], xy, 10, REACH, np.arange(10.0))
-    assert (len(whole.largest), whole.leaps) == (10, ())
+    near = [VerifiedPair(5, 6, np.zeros((0, 2), np.uint32), 0, np.zeros((3, 3, 3)))]
+    for pairs, times in ((near, None), ([], np.arange(10.0))):
+        whole = judge(made_model, pairs, xy, 10, REACH, times)
+        assert (len(whole.largest), whole.leaps) == (10, ())
+    parted = judge(made_model, near, xy, 10, REACH, np.arange(10.0))
     assert (parted.components, parted.leaps) == (((0, 1, 2, 3, 4, 5), (6, 7, 8, 9)), (6,))
 
 
