@@ -19,8 +19,6 @@ _FEWEST = 4
 """Faces that a mesh is not simplified below."""
 _SMOOTH = 5.0
 """How readily fast-simplification goes on to worse edges (its `agg`; lower is slower and keeps the shape better)."""
-_TRIES = 8
-"""How often fewer faces are asked for where rims and borders keep more than `most`."""
 _MOST = 4_000_000
 """Faces that are simplified at once, in 0.5 GB."""
 _SPOT = 200
@@ -78,9 +76,10 @@ def _labels_of_faces(mesh: MeshArrays) -> tuple[NDArray[Any], NDArray[np.int64],
 
 def smoothed_rims(mesh: MeshArrays) -> MeshArrays:
     """The mesh with its open edges in smooth lines in place of the steps of voxels."""
-    edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    rims, count = np.unique(edges, axis=0, return_counts=True)
-    rims, places = rims[count == 1], mesh.vertices.astype(np.float64)
+    edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).astype(np.int64)
+    places = mesh.vertices.astype(np.float64)
+    numbers, count = np.unique(edges[:, 0] * len(places) + edges[:, 1], return_counts=True)
+    rims = np.stack(np.divmod(numbers[count == 1], len(places)), 1)
     both = np.concatenate([rims, rims[:, ::-1]])
     degree = np.bincount(both[:, 0], minlength=len(places))
     inside = np.flatnonzero(degree == 2)
@@ -97,23 +96,19 @@ def simplified(mesh: MeshArrays, most: int, kept: NDArray[np.int64] | None = Non
 
     if len(mesh.faces) <= max(most, _FEWEST):
         return mesh
-    fins, faces = np.zeros((0, 3), np.float32), mesh.faces
+    fins, tried = np.zeros((0, 3), np.float32), [mesh.faces]
     if kept is not None and len(kept):
         fins = _above(mesh, kept)
         upright = np.column_stack([kept, len(mesh.vertices) + np.arange(len(kept))])
-        faces = np.concatenate([faces, upright.astype(np.int32)])
+        tried.insert(0, np.concatenate([mesh.faces, upright.astype(np.int32)]))
     points, tree = np.concatenate([mesh.vertices, fins]), cKDTree(np.concatenate([mesh.vertices, fins]))
-    wanted = float(most)
-    for number in range(_TRIES):
-        if number == _TRIES // 2:
-            faces = mesh.faces  # too much is kept
-        found, made = simplify(points, faces, target_count=max(int(wanted), _FEWEST), agg=_SMOOTH)
+    for faces in tried:  # where rims and borders keep too much, without these; fewer faces asked for change nothing
+        found, made = simplify(points, faces, target_count=max(most, _FEWEST), agg=_SMOOTH)
         found = found.astype(np.float32)
         nearest = tree.query(found)[1]
         made = made[(areas(found, made) > 0) & (nearest[made] < len(mesh.vertices)).all(axis=1)]
         if len(made) <= most:
             break
-        wanted *= 0.97 * most / len(made)
     if not len(made):
         return mesh  # it has no area at all
     used, renumbered = np.unique(made, return_inverse=True)
