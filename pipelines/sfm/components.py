@@ -37,9 +37,9 @@ MAX_SCALE_SD, _SIDE = 0.02, 15
 """Relative, of the scale of the way on against that of the way before, by so many cameras of each: what pairs alone do
 not hold together, fast steps along a corridor, does not part where this is known. There it is 0.003 to 0.017, where
 made and real homes break before bare walls 0.19 to 1.1. A house where it is 0.010 is off by 0.09."""
-LEAP = 3.0
-"""Times the speed that a path passes in one step of ten: of 24 recordings with a right path the fastest step has at
-most 2.1, of six that are torn or folded 4 to 60."""
+LEAP, _AROUND = 3.0, 3
+"""Times the speed that a path passes in one step of ten, and that of so many steps before and behind: of 24 recordings
+with a right path the fastest step has at most 2.1, of six that are torn or folded 4 to 60."""
 _AT_ONCE, _SHARED = 200, 80
 """Cameras of one dense covariance, and those that it has in common with the next."""
 
@@ -138,11 +138,13 @@ def _near(track: Sequence[int], place: dict[int, int], reach: int) -> list[list[
 
 def find_leaps(centers: Array, times: Array) -> list[int]:
     """Indices of the places (N, 3) of a path that are too far from the one before for the time between, (N,) seconds:
-    no camera in motion goes so much faster than it hardly ever does."""
-    if len(centers) < 2:
+    no camera goes so much faster than it hardly ever does, and than in all but two of the steps around."""
+    if len(centers) < 3:
         return []
     speed = np.linalg.norm(np.diff(centers, axis=0), axis=1) / np.maximum(np.diff(times), 1e-3)
-    return (np.flatnonzero(speed > LEAP * np.quantile(speed, 0.9)) + 1).tolist()
+    found = np.flatnonzero(speed > LEAP * np.quantile(speed, 0.9)).tolist()
+    around = {n: np.delete(speed[max(n - _AROUND, 0) : n + _AROUND + 1], min(n, _AROUND)) for n in found}
+    return [n + 1 for n in found if speed[n] > LEAP * np.sort(around[n])[-3:][0]]
 
 
 def worst_contradictions(seams: Iterable[Seam]) -> list[Seam]:

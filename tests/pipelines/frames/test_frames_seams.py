@@ -155,6 +155,15 @@ def test_a_path_leaps_where_no_camera_can_follow() -> None:
     assert find_leaps(centers[:1], times[:1]) == []
 
 
+def test_four_fast_steps_are_a_walk() -> None:
+    centers, times = np.zeros((COUNT, 3)), np.arange(float(COUNT))
+    centers[:, 0] = np.cumsum(np.full(COUNT, 0.1))
+    for steps, leaps in ((1, [20]), (3, [20, 21, 22]), (4, []), (10, [])):
+        walk = centers.copy()
+        walk[:, 0] += np.clip(np.arange(COUNT) - 19, 0, steps) * 0.9
+        assert find_leaps(walk, times) == leaps
+
+
 def test_a_model_is_cut_where_its_camera_leaps(made_model: pycolmap.Reconstruction) -> None:
     """Six keyframes and four more in a row with a long step between, though points are seen from both sides."""
     for i in range(1, 11):
