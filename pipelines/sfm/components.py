@@ -177,7 +177,7 @@ def find_components(
     run = np.cumsum([k in loose for k in placed], dtype=np.int64).tolist()
     number = max(run, default=0)
     shared = np.zeros((number + 1, number + 1), np.int64)
-    for track in tracks:
+    for track in tracks if number else ():
         near = [{run[n] for n in places} for places in _near(track, place, reach)]
         joined = {(min(ab), max(ab)) for first, second in combinations(near, 2) for ab in product(first, second)}
         joined |= {(a, b) for runs in near for a, b in combinations(sorted(runs), 2) if b > a + 1}

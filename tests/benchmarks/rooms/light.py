@@ -345,26 +345,9 @@ def _unevenness(at: Array) -> float:
 
 @numba.njit(cache=True, error_model="numpy")
 def _shade(
-    prim,
-    bu,
-    bv,
-    far,
-    ways,
-    flat,
-    places,
-    light,
-    material,
-    rgb,
-    texture,
-    emission,
-    density,
-    texels,
-    offsets,
-    focal,
-    points,
-    wear,
-    out,
-):  # type: ignore[no-untyped-def]
+    prim, bu, bv, far, ways, flat, places, light, material, rgb, texture, emission, density, texels, offsets, focal,
+    points, wear, out,
+):  # type: ignore[no-untyped-def]  # fmt: skip
     """Colour (N, 3) of what rays hit: texture or colour times the light on that side, and what it gives off."""
     fine, coarse = np.zeros(3, np.float32), np.zeros(3, np.float32)
     for i in range(len(prim)):
