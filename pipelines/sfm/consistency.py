@@ -26,6 +26,7 @@ from .components import (
 )
 from .lens import distortion_of
 from .matching import VerifiedPair
+from .rolling import FILM
 
 Array = NDArray[np.float64]
 
@@ -138,9 +139,9 @@ def judge(
     placed, tracks = sorted(views), tracks_of(model, total)
     centers = np.array([views[k].projection_center() for k in placed]).reshape(-1, 3)
     seams = find_seams(placed, checks, tracks, reach)
-    # Where nothing on one side matches the other, the film itself may have a cut.
+    # Where nothing on one side matches the other, the film may have a cut, which takes no time.
     fast = [] if times is None else [seams[n - 1] for n in find_leaps(centers, times[placed])]
-    leaps = [s.after for s in fast if s.pairs]
+    leaps = [s.after for s in fast if s.pairs or times[s.after] - times[s.before] > FILM]
     breaks = {*breaks, *leaps, *(s.after for s in worst_contradictions(seams))}
     seams = [replace(s, points=0) if s.after in breaks else s for s in seams]
     components = find_components(placed, seams, tracks, reach, breaks)

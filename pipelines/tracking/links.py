@@ -17,6 +17,7 @@ from ..geometry import se3
 from ..geometry.se3 import Similarity
 from ..sfm.components import find_leaps
 from ..sfm.features import GlobalDescriptors, far_apart, loop_pairs
+from ..sfm.rolling import FILM
 from ..types import Array, LoopEdge
 from .pnp import MIN_INLIERS, group_by_points, localise_in_groups
 from .state import Pictures, Sightings, TrackState
@@ -156,7 +157,10 @@ class LinkSearch:
         centers = se3.inverse(np.array([state.poses[i] for i in ids.tolist()]))[:, :3, 3]
         centers[moved] = move.apply(centers[moved])
         leaps = [ids[n - 1 : n + 1] for n in find_leaps(centers, self.times[ids]) if moved[n - 1] != moved[n]]
-        return any(a <= before and after <= b for before, after in leaps for a, b in self.near)
+        return any(
+            self.times[after] - self.times[before] > FILM or any(a <= before and after <= b for a, b in self.near)
+            for before, after in leaps
+        )
 
     def loops(self, track: Callable[[list[_Asked]], Iterable[_Asked]]) -> list[Link]:
         """Return the links within segments that the path can have drifted by and that a second one supports; `track`
