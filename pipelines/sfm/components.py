@@ -8,6 +8,7 @@ distances can grow, while every point stays within a fraction of a pixel.
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, groupby, pairwise, product
@@ -40,6 +41,12 @@ made and real homes break before bare walls 0.19 to 1.1. A house where it is 0.0
 LEAP, _AROUND = 3.0, 3
 """Times the speed that a path passes in one step of ten, and that of so many steps before and behind: of 24 recordings
 with a right path the fastest step has at most 2.1, of six that are torn or folded 4 to 60."""
+_FLAT, _ON_PLANE = 0.05, 0.9
+"""How far from a plane points lie on it, over their median distance from the middle of all, and the share of points
+that are one plane. Of loops between rooms of made homes the false ones, a door or a picture that is like another, have
+0.93 to 1, those of several things 0.3 to 0.75."""
+_PLANES, _SAMPLED = 200, 2000
+"""Planes that are tried, and about how many points they are tried on."""
 _AT_ONCE, _SHARED = 200, 80
 """Cameras of one dense covariance, and those that it has in common with the next."""
 
@@ -164,29 +171,39 @@ def remove_keyframes(model: pycolmap.Reconstruction, keyframes: Iterable[int]) -
 def find_components(
     placed: Sequence[int],
     seams: Iterable[Seam],
-    tracks: Iterable[Sequence[int]],
+    tracks: Sequence[Sequence[int]],
     reach: int,
     breaks: Container[int] = (),
+    points: Array | None = None,
 ) -> list[list[int]]:
     """Divide placed keyframes into components, largest first: runs between loose seams, joined where a loop, what is
     seen again more than `reach` places later, holds them together. No loop, the surest first, joins what is before and
     behind a keyframe of `breaks`: what looks alike in two rooms would; beyond a short run between two of those what is
-    seen from both sides does."""
+    seen from both sides does. Nor do loops whose `points`, (T, 3) of the tracks, lie on one plane in rooms: doors and
+    pictures are alike."""
     place = {k: n for n, k in enumerate(placed)}
     loose = {s.after for s in seams if s.is_weak_link}
     run = np.cumsum([k in loose for k in placed], dtype=np.int64).tolist()
     number = max(run, default=0)
-    shared = np.zeros((number + 1, number + 1), np.int64)
-    for track in tracks if number else ():
-        near = [{run[n] for n in places} for places in _near(track, place, reach)]
-        joined = {(min(ab), max(ab)) for first, second in combinations(near, 2) for ab in product(first, second)}
-        joined |= {(a, b) for runs in near for a, b in combinations(sorted(runs), 2) if b > a + 1}
-        for a, b in joined:
-            shared[a, b] += 1
+    loops, across = defaultdict[tuple[int, int], list[int]](list), Counter[tuple[int, int]]()
+    for n, track in enumerate(tracks if number else ()):
+        near = [{run[at] for at in places} for places in _near(track, place, reach)]
+        across.update({(a, b) for runs in near for a, b in combinations(sorted(runs), 2) if b > a + 1})
+        for ab in {(min(ab), max(ab)) for first, second in combinations(near, 2) for ab in product(first, second)}:
+            loops[ab].append(n)
     parted = [run[place[k]] for k in placed if k in loose and k in breaks]
     label = list(range(number + 1))
-    joins = np.argwhere(np.triu(shared, 1) >= 2 * MIN_POINTS).tolist()
-    for a, b in sorted(joins, key=lambda ab: -shared[*ab]):
+    held = {ab: across[ab] + len(loops[ab]) for ab in sorted({*across, *loops}) if ab[0] != ab[1]}
+
+    def is_one_thing(a: int, b: int) -> bool:
+        if points is None or across[a, b] >= 2 * MIN_POINTS:
+            return False
+        around = [n for n, track in enumerate(tracks) if any(run[place[k]] in (a, b) for k in track)]
+        return is_flat_within(points[loops[a, b]], points[around])
+
+    for a, b in sorted(held, key=lambda ab: -held[ab]):
+        if held[a, b] < 2 * MIN_POINTS or is_one_thing(a, b):
+            continue
         together = [label[a] if x == label[b] else x for x in label]
         if all(together[n - 1] != together[n] for n in parted):
             label = together
@@ -194,6 +211,25 @@ def find_components(
     for k in placed:
         components.setdefault(label[run[place[k]]], []).append(k)
     return sorted(components.values(), key=lambda p: (-len(p), p[0]))
+
+
+def is_flat_within(points: Array, around: Array) -> bool:
+    """Return whether points (N, 3) lie on one plane, though what is around (M, 3) does not, as from high above."""
+    return are_on_one_plane(points) and not are_on_one_plane(around)
+
+
+def are_on_one_plane(points: Array) -> bool:
+    """Return whether most points (N, 3) lie on one plane, by the best of planes through three of them."""
+    if len(points) < 4:
+        return True
+    off = points[:: -(-len(points) // _SAMPLED)]
+    off = off - np.median(off, axis=0)
+    corners = off[np.random.default_rng(0).integers(0, len(off), (_PLANES, 3))]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    distance = np.abs(normal @ off.T - (normal * corners[:, 0]).sum(1, keepdims=True))
+    near = distance < _FLAT * float(np.median(np.linalg.norm(off, axis=1))) * length
+    return bool(near.mean(1).max() >= _ON_PLANE)
 
 
 def tracks_of(model: pycolmap.Reconstruction, total: int) -> list[list[int]]:

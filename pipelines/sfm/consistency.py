@@ -144,7 +144,8 @@ def judge(
     leaps = [s.after for s in fast if s.pairs or times[s.after] - times[s.before] > FILM]
     breaks = {*breaks, *leaps, *(s.after for s in worst_contradictions(seams))}
     seams = [replace(s, points=0) if s.after in breaks else s for s in seams]
-    components = find_components(placed, seams, tracks, reach, breaks)
+    points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3)
+    components = find_components(placed, seams, tracks, reach, breaks, points)
     parts, seen = ([placed], xy) if straight is None else (components, straight)
     drifts = (scale_drift(model, pairs, seen, total, reach, part) for part in parts)
     return ModelReport(

@@ -15,7 +15,7 @@ from scipy.sparse import csr_matrix
 
 from ..geometry import se3
 from ..geometry.se3 import Similarity
-from ..sfm.components import find_leaps
+from ..sfm.components import find_leaps, is_flat_within
 from ..sfm.features import GlobalDescriptors, far_apart, loop_pairs
 from ..sfm.rolling import FILM
 from ..types import Array, LoopEdge
@@ -144,7 +144,16 @@ class LinkSearch:
             if (link := self.recognise(ours[n], known)) is not None:
                 found.append(link)
         agreeing = max((self._agreeing(link, found) for link in found), key=len, default=[])
-        return agreeing if len(agreeing) > 1 and not self._leaps(segment, main, agreeing[0].move) else []
+        if len(agreeing) < 2 or self._leaps(segment, main, agreeing[0].move) or self._is_one_thing(agreeing, theirs):
+            return []
+        return agreeing
+
+    def _is_one_thing(self, links: Iterable[Link], keyframes: Iterable[int]) -> bool:
+        """Whether links to these keyframes recognise one plane in a room: doors and pictures are alike."""
+        state = self.state
+        shared = np.unique(np.concatenate([link.seen.point for link in links]))
+        around = np.unique(np.concatenate([state.sightings[k].point for k in keyframes]))
+        return is_flat_within(state.points[shared], state.points[around])
 
     def _leaps(self, segment: int, main: int, move: Similarity) -> bool:
         """Whether the camera of a film would leap between two segments, of which `move` takes the first to the other,

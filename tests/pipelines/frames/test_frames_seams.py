@@ -15,6 +15,7 @@ from msgs_slam.pipelines.sfm.adjust import adjust_model
 from msgs_slam.pipelines.sfm.components import (
     PairCheck,
     Seam,
+    are_on_one_plane,
     cut,
     find_components,
     find_leaps,
@@ -134,6 +135,23 @@ def test_no_loop_joins_what_a_break_parts() -> None:
     assert sizes((), []) == [COUNT]
     assert sizes((25,), []) == sizes((25,), [[5, 20]] * 60) == [27, 13]
     assert sizes((25,), [[5, 20]] * 120) == [25, 15]
+
+
+def test_no_loop_of_one_plane_joins_rooms() -> None:
+    """A door that is like another, and is a door of a room; from high above all there is is one plane."""
+    rng = np.random.default_rng(0)
+    tracks = [*_tracks(25), *[[2, 38]] * 60]
+    seams, is_loop = find_seams(range(COUNT), _checks(0), tracks, REACH), np.arange(len(tracks)) >= len(tracks) - 60
+    room, door = rng.uniform(0, 4, (len(tracks), 3)), rng.uniform(0, 1, (len(tracks), 3)) * (1, 2, 0)
+    for points, parts in (
+        (room, [COUNT]),
+        (np.where(is_loop[:, None], door, room), [25, 15]),
+        (room * (1, 1, 0), [COUNT]),
+    ):
+        found = find_components(range(COUNT), seams, tracks, REACH, points=points)
+        assert [len(p) for p in found] == parts
+    assert are_on_one_plane(room[:3])
+    assert not are_on_one_plane(room)
 
 
 def test_a_keyframe_astray_does_not_part_what_is_around_it() -> None:

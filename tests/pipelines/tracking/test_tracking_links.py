@@ -230,7 +230,7 @@ def test_a_film_does_not_join_rooms_that_only_look_alike() -> None:
     """The far side of the room is taken for the near one: the camera would leap from one keyframe to the next, but
     where nothing says that these follow on each other."""
     for near, segments in (([], {0}), ([(3, 5), (15, 18)], {0, 1}), ([(3, 5), (14, 16), (17, 20)], {0})):
-        search = replace(make_walk(twins=True).search(), near=near, times=np.arange(40.0))
+        search = replace(make_walk(twins=True).search(), near=near, times=np.arange(40.0) / 8)
         state = search.state
         for k in range(40):
             late = 17 <= k < 25
@@ -238,6 +238,22 @@ def test_a_film_does_not_join_rooms_that_only_look_alike() -> None:
             state.segment[k] = int(late)
         search.join_segments()
         assert set(state.segment.values()) == segments
+
+
+@pytest.mark.parametrize("is_flat", [False, True])
+def test_segments_that_share_one_plane_of_a_room_are_not_joined(is_flat: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    search = make_walk().search()
+    for k in range(34, 40):
+        search.state.segment[k] = 1
+    counts = set[bool]()
+
+    def flat(points: NDArray[np.float64], around: NDArray[np.float64]) -> bool:
+        counts.add(20 < len(points) < len(around))
+        return is_flat
+
+    monkeypatch.setattr(links, "is_flat_within", flat)
+    search.join_segments()
+    assert (set(search.state.segment.values()), counts) == ({0, 1} if is_flat else {0}, {True})
 
 
 def test_stretches_are_compared_again_only_with_what_has_joined_since(monkeypatch: pytest.MonkeyPatch) -> None:
