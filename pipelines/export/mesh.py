@@ -31,7 +31,7 @@ from .inventory import FoundThings, things_in
 from .light import SHARE, clustered, lightened, smoothed_rims
 from .planes import Planes, planes_of, put_planes, snap_to_planes
 from .scene import ExportScene, write_things
-from .surface import Region, chunk_surfaces, closed, filled, joined, weld
+from .surface import Region, chunk_surfaces, closed, filled, joined, patched, weld
 from .texture import textured
 from .volume import BEHIND, Grid, fuse, make_grid
 
@@ -45,6 +45,8 @@ SURE = 0.5
 """Confidence of a proxy's depth from which the depth drawn there stays where it is."""
 _BEFORE = 0.05
 """A face is hidden behind what is nearer by this part."""
+_PATCHES = 0.2
+"""Part of the triangles of the lighter mesh that is kept for patches."""
 _KEPT_BYTES = 100e6
 
 
@@ -88,7 +90,9 @@ def write_mesh(scene: ExportScene, target: Target) -> None:
     most = min(settings.triangles, round(SHARE * len(mesh.faces))) if settings.texture else settings.triangles
     kinds, label_of, thing_of = _kinds(mesh, things)
     of_kinds = replace(mesh, labels=kinds)  # type: ignore[arg-type] # any integers do
-    light, of_faces = lightened(filled(smoothed_rims(clustered(of_kinds)), shown), most)
+    light, of_faces = lightened(filled(smoothed_rims(clustered(of_kinds)), shown), round((1 - _PATCHES) * most))
+    light, middles = patched(light, shown, settings.triangles), _middles(light)
+    of_faces = of_faces[cKDTree(middles).query(_middles(light))[1]]
     labels = label_of[of_faces]
     if settings.texture:
         made = textured(outcome, light, labels, shown, context.progress)
@@ -123,13 +127,17 @@ def _kinds(mesh: MeshArrays, things: FoundThings) -> tuple[NDArray[np.int64], ND
 
 def _is_hidden(mesh: MeshArrays, views: Iterable[PosedDepth]) -> NDArray[np.bool_]:
     """(F,) whether no view sees a face's middle."""
-    middles, hidden = mesh.vertices[mesh.faces].mean(axis=1).astype(np.float64), np.ones(len(mesh.faces), bool)
+    middles, hidden = _middles(mesh), np.ones(len(mesh.faces), bool)
     for view in views:
         xy, z, inside = view.seen(middles)
         rows = np.flatnonzero(inside & hidden)
         column, row = xy[rows].astype(int).T
         hidden[rows[view.depth[row, column] > (1 - _BEFORE) * z[rows]]] = False
     return hidden
+
+
+def _middles(mesh: MeshArrays) -> NDArray[np.float64]:
+    return mesh.vertices[mesh.faces].mean(axis=1).astype(np.float64)
 
 
 def _scratch(context: StageContext) -> Path:

@@ -10,13 +10,15 @@ import pytest
 import trimesh
 from ball import CAMERA, RADIUS, orbit, pixel_rays, see_ball, seen_points
 from numpy.typing import NDArray
+from scipy.ndimage import binary_fill_holes
 
-from msgs_slam.formats.ply import read_mesh_ply, write_mesh_ply
+from msgs_slam.formats.ply import MeshArrays, read_mesh_ply, write_mesh_ply
 from msgs_slam.pipelines.export.mesh import paint
-from msgs_slam.pipelines.export.surface import Region, Surface, Triangles, chunk_surfaces, closed, joined, weld
+from msgs_slam.pipelines.export.surface import Region, Surface, Triangles, chunk_surfaces, closed, joined, patched, weld
 from msgs_slam.pipelines.export.volume import CHUNK, Grid, Volume, fuse, make_grid
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.mapping.measure import MeshView
+from msgs_slam.pipelines.system.raster import draw_faces
 from msgs_slam.pipelines.system.threads import get_threads, set_threads
 from msgs_slam.pipelines.system.values import load_value, save_value
 from msgs_slam.pipelines.types import VOID
@@ -155,6 +157,44 @@ def test_a_step_of_the_depth_leaves_no_slit() -> None:
     # A rim that stands before nothing gets no thickness
     alone = [replace(v, trust=np.where(v.depth < 1.1, 1, 0).astype(np.float32)) for v in views]
     assert np.abs(extracted(alone, VOXEL, 100_000, 0.5).triangles_center[:, 2] - 1).max() < VOXEL
+
+
+def test_what_a_view_sees_in_slits_and_holes_is_covered_at_its_depth() -> None:
+    """Half of a wall 15 cm nearer than the other, more than the truncation, and a hole where one view is not sure."""
+
+    def wall(right: float) -> PosedDepth:
+        pose = np.eye(4)
+        pose[0, 3] = -right
+        depth = np.where(pixel_rays()[..., 0] + right < 0, 1.0, 1.15).astype(np.float32)
+        trust = np.ones(depth.shape, np.float32)
+        trust[20:30, 10:24] = 0
+        return PosedDepth(CAMERA, pose, depth, trust)
+
+    views = [wall(0.0), wall(0.0), wall(0.1)]
+    found = extracted(views[:2], VOXEL, 100_000, 0.5, closing=False)
+    mesh = MeshArrays(
+        found.vertices.astype(np.float32), found.faces.astype(np.int32),
+        np.full((len(found.vertices), 3), 7, np.uint8), np.full(len(found.vertices), 3, np.uint8),
+    )  # fmt: skip
+    whole = patched(mesh, views, 100_000)
+
+    def enclosed(mesh: MeshArrays, view: PosedDepth) -> int:
+        drawn = draw_faces(mesh.vertices, mesh.faces, view.cam_from_world, view.intrinsics)
+        inside = binary_fill_holes(np.pad(drawn.face >= 0, 1, mode="edge"))[1:-1, 1:-1]
+        return int((inside & (drawn.face < 0)).sum())
+
+    assert enclosed(mesh, views[0]) > 100
+    assert [enclosed(whole, view) for view in views] == [0, 0, 0]
+    new = whole.vertices[whole.faces[len(mesh.faces) :]]
+    assert np.abs(new[..., 2:] - [1, 1.15]).min(-1).max() < 0.04
+    assert np.ptp(new[..., 2], axis=1).max() < 0.03
+    assert (np.cross(new[:, 1] - new[:, 0], new[:, 2] - new[:, 0])[:, 2] < 0).all(), "they look at the camera"
+    assert (set(whole.colors.flat), set(whole.labels)) == ({7}, {3})
+    assert len(patched(whole, views, 100_000).faces) - len(whole.faces) < 0.1 * len(new)
+    few = patched(mesh, views, len(whole.faces) - 1)
+    assert len(mesh.faces) <= len(few.faces) < len(whole.faces)
+    nothing = MeshArrays(mesh.vertices[:0], mesh.faces[:0], mesh.colors[:0], mesh.labels[:0])
+    assert len(patched(nothing, views, 100_000).faces) == 0
 
 
 def test_unseen_vertices_are_as_the_nearest_seen_one() -> None:
