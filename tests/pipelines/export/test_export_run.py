@@ -123,7 +123,7 @@ def test_mesh_lies_on_the_map_and_stands_upright(folder: Path, exported: Outcome
 def test_texture_shows_the_photographs(run: RunFolder, folder: Path, exported: Outcome) -> None:
     mesh, whole = (trimesh.load(folder / n, force="mesh", process=False) for n in ("mesh.glb", "mesh.ply"))
     mesh.vertices = mesh.vertices[:, [0, 2, 1]] * (1, -1, 1)
-    assert len(mesh.faces) <= 0.1 * len(whole.faces)
+    assert len(mesh.faces) <= 0.35 * len(whole.faces)  # a tenth, and what covers the many slits of small views
     colors = mesh.visual.to_color().vertex_colors[:, :3].astype(int)
     frame = exported.frames[0]
     pose, k = exported.trajectory.cam_from_world[0], exported.calibration.intrinsics
@@ -146,8 +146,8 @@ def test_one_kind_of_mesh_and_colours_without_a_texture(run: RunFolder, tmp_path
     assert 0.9 * len(ply.faces) < len(glb.faces) < 1.2 * len(ply.faces)
     places = glb.vertices[:, [0, 2, 1]] * (1, -1, 1)
     away = cKDTree(ply.vertices).query(places)[0]
-    assert (away < 1e-5).mean() > 0.7  # all but the rims
-    assert away.max() < 0.1
+    assert (away < 1e-5).mean() > 0.7  # all but the rims and the patches
+    assert np.quantile(away, 0.98) < 0.1
     light = replace(few, triangles=500)
     export_run(run, tmp_path / "light", "mesh", settings=light)
     glb = trimesh.load_scene(tmp_path / "light" / "mesh.glb", process=False)
