@@ -41,6 +41,8 @@ made and real homes break before bare walls 0.19 to 1.1. A house where it is 0.0
 LEAP, _AROUND = 3.0, 3
 """Times the speed that a path passes in one step of ten, and that of so many steps before and behind: of 24 recordings
 with a right path the fastest step has at most 2.1, of six that are torn or folded 4 to 60."""
+_LOOP_POINTS = 4 * MIN_POINTS
+"""Of a loop between two runs: of false ones one of several things has 24, the right ones have 160 and more."""
 _FLAT, _ON_PLANE = 0.05, 0.9
 """How far from a plane points lie on it, over their median distance from the middle of all, and the share of points
 that are one plane. Of loops between rooms of made homes the false ones, a door or a picture that is like another, have
@@ -195,14 +197,14 @@ def find_components(
     label = list(range(number + 1))
     held = {ab: across[ab] + len(loops[ab]) for ab in sorted({*across, *loops}) if ab[0] != ab[1]}
 
-    def is_one_thing(a: int, b: int) -> bool:
-        if points is None or across[a, b] >= 2 * MIN_POINTS:
-            return False
+    def is_sure(a: int, b: int) -> bool:
+        if across[a, b] >= 2 * MIN_POINTS or points is None:
+            return held[a, b] >= 2 * MIN_POINTS
         around = [n for n, track in enumerate(tracks) if any(run[place[k]] in (a, b) for k in track)]
-        return is_flat_within(points[loops[a, b]], points[around])
+        return held[a, b] >= _LOOP_POINTS and not is_flat_within(points[loops[a, b]], points[around])
 
     for a, b in sorted(held, key=lambda ab: -held[ab]):
-        if held[a, b] < 2 * MIN_POINTS or is_one_thing(a, b):
+        if not is_sure(a, b):
             continue
         together = [label[a] if x == label[b] else x for x in label]
         if all(together[n - 1] != together[n] for n in parted):
