@@ -174,9 +174,9 @@ def find_components(
     placed: Sequence[int],
     seams: Iterable[Seam],
     tracks: Sequence[Sequence[int]],
+    points: Array,
     reach: int,
     breaks: Container[int] = (),
-    points: Array | None = None,
 ) -> list[list[int]]:
     """Divide placed keyframes into components, largest first: runs between loose seams, joined where a loop, what is
     seen again more than `reach` places later, holds them together. No loop, the surest first, joins what is before and
@@ -198,10 +198,12 @@ def find_components(
     held = {ab: across[ab] + len(loops[ab]) for ab in sorted({*across, *loops}) if ab[0] != ab[1]}
 
     def is_sure(a: int, b: int) -> bool:
-        if across[a, b] >= 2 * MIN_POINTS or points is None:
-            return held[a, b] >= 2 * MIN_POINTS
+        if across[a, b] >= 2 * MIN_POINTS:
+            return True
+        if held[a, b] < _LOOP_POINTS:
+            return False
         around = [n for n, track in enumerate(tracks) if any(run[place[k]] in (a, b) for k in track)]
-        return held[a, b] >= _LOOP_POINTS and not is_flat_within(points[loops[a, b]], points[around])
+        return not is_flat_within(points[loops[a, b]], points[around])
 
     for a, b in sorted(held, key=lambda ab: -held[ab]):
         if not is_sure(a, b):

@@ -145,7 +145,7 @@ def judge(
     breaks = {*breaks, *leaps, *(s.after for s in worst_contradictions(seams))}
     seams = [replace(s, points=0) if s.after in breaks else s for s in seams]
     points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3)
-    components = find_components(placed, seams, tracks, reach, breaks, points)
+    components = find_components(placed, seams, tracks, points, reach, breaks)
     parts, seen = ([placed], xy) if straight is None else (components, straight)
     drifts = (scale_drift(model, pairs, seen, total, reach, part) for part in parts)
     return ModelReport(

@@ -1,7 +1,7 @@
 """Places where a path is torn, or its scale changes, are found, however good the rest is; what they part is cut."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,6 +34,14 @@ from tests.pipelines.frames.made_views import REACH as WALK_REACH
 from tests.pipelines.frames.made_views import MadeViews, walk_round
 
 COUNT, REACH = 40, 4
+
+
+def _components(
+    placed: Sequence[int], seams: Sequence[Seam], tracks: Sequence[Sequence[int]], breaks: tuple[int, ...] = ()
+) -> list[list[int]]:
+    """Of tracks whose points lie anywhere."""
+    points = np.random.default_rng(0).uniform(size=(len(tracks), 3))
+    return find_components(placed, seams, tracks, points, REACH, breaks)
 
 
 def _checks(torn_at: int) -> list[PairCheck]:
@@ -88,7 +96,7 @@ def test_what_is_taken_out_leaves_no_observation(made_model: pycolmap.Reconstruc
 
 
 def test_a_model_of_nothing_has_no_part() -> None:
-    assert find_components([], find_seams([], [], [], REACH), [], REACH) == []
+    assert _components([], find_seams([], [], [], REACH), []) == []
     model = pycolmap.Reconstruction()
     model.add_camera(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 300.0, 320, 240))
     report = judge(model, [], [], 4, REACH)
@@ -102,7 +110,7 @@ def test_keyframes_that_were_not_placed_leave_a_gap() -> None:
     seams = find_seams(placed, checks, tracks, REACH)
     assert Seam(9, 13, 20, 4, 1.0) not in seams  # points of four neighbours reach 12 at most
     assert next(s for s in seams if s.before == 9).is_weak_link
-    assert find_components(placed, seams, tracks, REACH) == [list(range(13, COUNT)), list(range(10))]
+    assert _components(placed, seams, tracks) == [list(range(13, COUNT)), list(range(10))]
 
 
 def test_where_two_structures_share_one_keyframe_alone_nothing_holds_their_sizes() -> None:
@@ -110,7 +118,7 @@ def test_where_two_structures_share_one_keyframe_alone_nothing_holds_their_sizes
     row = [t for t in _tracks() if t[-1] <= 20 or t[0] >= 20]
     seams = find_seams(range(COUNT), _checks(0), row, REACH)
     assert [s.points for s in seams[19:21]] == [0, 20]  # before the keyframe, and behind it
-    assert [len(p) for p in find_components(range(COUNT), seams, row, REACH)] == [20, 20]
+    assert [len(p) for p in _components(range(COUNT), seams, row)] == [20, 20]
     tied = row + [[19, 20, 21]] * 12
     assert not any(s.is_weak_link for s in find_seams(range(COUNT), _checks(0), tied, REACH))
     skipping = row + [[19, 21]] * 50  # directions from one to the other, but no size
@@ -120,7 +128,7 @@ def test_where_two_structures_share_one_keyframe_alone_nothing_holds_their_sizes
 def test_a_loop_holds_two_runs_together() -> None:
     for loop, parts in ((None, [25, 15]), ((2, 38), [COUNT])):
         tracks = _tracks(25, loop)
-        found = find_components(range(COUNT), find_seams(range(COUNT), _checks(0), tracks, REACH), tracks, REACH)
+        found = _components(range(COUNT), find_seams(range(COUNT), _checks(0), tracks, REACH), tracks)
         assert [len(p) for p in found] == parts
 
 
@@ -130,7 +138,7 @@ def test_no_loop_joins_what_a_break_parts() -> None:
     seams = find_seams(range(COUNT), _checks(0), tracks, REACH)
 
     def sizes(breaks: tuple[int, ...], more: list[list[int]]) -> list[int]:
-        return [len(p) for p in find_components(range(COUNT), seams, [*tracks, *more], REACH, breaks)]
+        return [len(p) for p in _components(range(COUNT), seams, [*tracks, *more], breaks)]
 
     assert sizes((), []) == [COUNT]
     assert sizes((25,), []) == sizes((25,), [[5, 20]] * 60) == [27, 13]
@@ -148,7 +156,7 @@ def test_no_loop_of_one_plane_joins_rooms() -> None:
         (np.where(is_loop[:, None], door, room), [25, 15]),
         (room * (1, 1, 0), [COUNT]),
     ):
-        found = find_components(range(COUNT), seams, tracks, REACH, points=points)
+        found = find_components(range(COUNT), seams, tracks, points, REACH)
         assert [len(p) for p in found] == parts
     assert are_on_one_plane(room[:3])
     assert not are_on_one_plane(room)
@@ -157,7 +165,7 @@ def test_no_loop_of_one_plane_joins_rooms() -> None:
 def test_a_keyframe_astray_does_not_part_what_is_around_it() -> None:
     seams = find_seams(range(COUNT), _checks(0), _tracks(), REACH)
     cut_around = [replace(s, points=0) if s.after in (20, 21) else s for s in seams]
-    found = find_components(range(COUNT), cut_around, _tracks(), REACH, (20, 21))
+    found = _components(range(COUNT), cut_around, _tracks(), (20, 21))
     assert [len(p) for p in found] == [COUNT - 1, 1]
     assert found[1] == [20]
 
