@@ -19,6 +19,8 @@ _FEWEST = 4
 """Faces that a mesh is not simplified below."""
 _SMOOTH = 5.0
 """How readily fast-simplification goes on to worse edges (its `agg`; lower is slower and keeps the shape better)."""
+_LINE = 1e-4
+"""Area over the square of the longest side up to which a triangle is a line."""
 _MOST = 4_000_000
 """Faces that are simplified at once, in 0.5 GB."""
 _SPOT = 200
@@ -106,7 +108,7 @@ def simplified(mesh: MeshArrays, most: int, kept: NDArray[np.int64] | None = Non
         found, made = simplify(points, faces, target_count=max(most, _FEWEST), agg=_SMOOTH)
         found = found.astype(np.float32)
         nearest = tree.query(found)[1]
-        made = made[(areas(found, made) > 0) & (nearest[made] < len(mesh.vertices)).all(axis=1)]
+        made = made[~are_slivers(found, made) & (nearest[made] < len(mesh.vertices)).all(axis=1)]
         if len(made) <= most:
             break
     if not len(made):
@@ -124,6 +126,12 @@ def _above(mesh: MeshArrays, edges: NDArray[np.int64]) -> NDArray[np.float32]:
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     high = np.linalg.norm(second - first, axis=1, keepdims=True)
     return ((first + second) / 2 + high * normals).astype(np.float32)
+
+
+def are_slivers(vertices: NDArray[np.float32], faces: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Return which triangles (F,) are lines: laid flat, one is drawn out over a whole texture."""
+    sides = np.linalg.norm(vertices[faces].astype(np.float64) - vertices[np.roll(faces, 1, axis=1)], axis=2)
+    return np.asarray(areas(vertices, faces) <= _LINE * sides.max(axis=1) ** 2)
 
 
 def areas(vertices: NDArray[np.float32], faces: NDArray[np.integer]) -> NDArray[np.float64]:

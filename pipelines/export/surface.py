@@ -8,12 +8,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, binary_fill_holes
+from scipy.ndimage import binary_fill_holes
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -40,9 +40,9 @@ _FOLDED = -0.9
 """Cosine to the normals around up to which a triangle lies folded back over the mesh."""
 _LEVELS, _GROWTH = 7, 1.5
 """Widths up to which bays are closed in turn, each so many times the one before."""
-_ACROSS, _SLIT, _SAME_SIDE = 320, 11, 0.03
-"""Pixels of a view's longer side that patches are made in, how wide a slit is, and the part by which depths differ at
-most that are one patch."""
+_ACROSS, _SLIT, _SAME_SIDE, _OVER = 320, 11, 0.03, 0.75
+"""Pixels of a view's longer side that patches are made in, how wide a slit is, the part by which depths differ at most
+that are one patch, and how far patches reach over the rim of what is missing."""
 
 
 @dataclass(frozen=True)
@@ -388,24 +388,24 @@ def _is_seen(
     return np.asarray(supports >= np.maximum(opposes, 1))
 
 
-def patched(mesh: MeshArrays, views: Iterable[PosedDepth], most: int) -> MeshArrays:
+def patched(mesh: MeshArrays, views: Sequence[PosedDepth], most: int) -> MeshArrays:
     """Cover what views see in slits and holes of the mesh: a square a pixel, at the depth that the view knows there,
     up to so many faces in all.
 
-    What an earlier view has covered is covered for the later ones. Corners between pixels of nearly one depth are
-    common to their squares, and at a step of the depth none: nothing reaches from what is near to what is behind it.
+    What an earlier view has covered is covered for the later ones; it is looked at again, for what those may have
+    enclosed. Corners between pixels of nearly one depth are common to their squares, and at a step of the depth none:
+    nothing reaches from what is near to what is behind it.
     """
     vertices, faces, colors, labels = mesh.vertices, mesh.faces, mesh.colors, mesh.labels
     tree = cKDTree(vertices) if len(vertices) else None
-    for view in views:
+    for view in chain(views, views):
         stride = -(-max(view.depth.shape) // _ACROSS)
         depth, camera = view.depth[stride // 2 :: stride, stride // 2 :: stride], view.intrinsics.every(stride)
         drawn = draw_faces(vertices, faces, view.cam_from_world, camera).depth
         missing = _is_enclosed(drawn > 0) & (depth > 0)
         if tree is None or not missing.any():
             continue
-        wanted = binary_dilation(missing, np.ones((3, 3))) & ((drawn > 0) | missing)
-        xy, z, corners = _squares(wanted, np.where(drawn > 0, drawn, depth).astype(np.float64))
+        xy, z, corners = _squares(missing, np.where(drawn > 0, drawn, depth).astype(np.float64))
         if len(faces) + len(corners) > most:
             break
         seen = PosedDepth(camera, view.cam_from_world, depth, depth)
@@ -428,9 +428,10 @@ def _squares(
     wanted: NDArray[np.bool_], depth: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
     """Two triangles (F, 3) for each wanted pixel (H, W), of corners at xy (C, 2) with z (C,): the harmonic mean of
-    those of the four pixels there that are about as far away."""
+    those of the four pixels there that are about as far away. Corners on the rim lie `_OVER` beyond it."""
     row, column = np.nonzero(wanted)
-    own, around = depth[row, column], np.pad(depth, 1)
+    own, around, inside = depth[row, column], np.pad(depth, 1), np.pad(wanted, 1).astype(np.int64)
+    out = [np.sign(np.diff(inside[:, 1:] + inside[:, :-1], axis=0)), np.sign(np.diff(inside[1:] + inside[:-1], axis=1))]
     corners, places = [], []
     for down, right in ((0, 0), (1, 0), (1, 1), (0, 1)):
         beside = np.stack([around[row + down + a, column + right + b] for a in (0, 1) for b in (0, 1)])
@@ -440,5 +441,6 @@ def _squares(
     keys = np.stack([np.concatenate(places).astype(np.float64), np.concatenate(corners)], 1)
     unique, number = np.unique(keys, axis=0, return_inverse=True)
     a, b, c, d = number.reshape(4, -1).astype(np.int32)
-    at = np.stack(np.divmod(unique[:, 0].astype(np.int64), depth.shape[1] + 1)[::-1], 1).astype(np.float64)
+    y, x = np.divmod(unique[:, 0].astype(np.int64), depth.shape[1] + 1)
+    at = np.stack([x - _OVER * out[1][y, x], y - _OVER * out[0][y, x]], 1)
     return at, unique[:, 1], np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
