@@ -139,9 +139,11 @@ def judge(
     placed, tracks = sorted(views), tracks_of(model, total)
     centers = np.array([views[k].projection_center() for k in placed]).reshape(-1, 3)
     seams = find_seams(placed, checks, tracks, reach)
-    # Where nothing on one side matches the other, the film may have a cut, which takes no time.
-    fast = [] if times is None else [seams[n - 1] for n in find_leaps(centers, times[placed])]
-    leaps = [s.after for s in fast if s.pairs or times[s.after] - times[s.before] > FILM]
+    leaps: list[int] = []
+    if times is not None:
+        fast = [seams[n - 1] for n in find_leaps(centers, times[placed])]
+        # Where nothing on one side matches the other, the film may have a cut, which takes no time.
+        leaps = [s.after for s in fast if s.pairs or times[s.after] - times[s.before] > FILM]
     breaks = {*breaks, *leaps, *(s.after for s in worst_contradictions(seams))}
     seams = [replace(s, points=0) if s.after in breaks else s for s in seams]
     points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3)
