@@ -434,9 +434,9 @@ def _squares(
     out = [np.sign(np.diff(inside[:, 1:] + inside[:, :-1], axis=0)), np.sign(np.diff(inside[1:] + inside[:-1], axis=1))]
     corners, places = [], []
     for down, right in ((0, 0), (1, 0), (1, 1), (0, 1)):
-        beside = np.stack([around[row + down + a, column + right + b] for a in (0, 1) for b in (0, 1)])
-        alike = (np.abs(beside - own) <= _SAME_SIDE * own) & (beside > 0)
-        corners.append(alike.sum(0) / np.where(alike, 1 / np.maximum(beside, 1e-300), 0).sum(0))
+        neighbours = np.stack([around[row + down + a, column + right + b] for a in (0, 1) for b in (0, 1)])
+        alike = (np.abs(neighbours - own) <= _SAME_SIDE * own) & (neighbours > 0)
+        corners.append(alike.sum(0) / np.where(alike, 1 / np.maximum(neighbours, 1e-300), 0).sum(0))
         places.append((row + down) * (depth.shape[1] + 1) + column + right)
     keys = np.stack([np.concatenate(places).astype(np.float64), np.concatenate(corners)], 1)
     unique, number = np.unique(keys, axis=0, return_inverse=True)
