@@ -161,7 +161,8 @@ class CandidateModels:
         camera = self._by_stretch(views, pairs)
         if camera is None:
             return found
-        other = replace(self, camera=camera, snapshots=self.snapshots.inside("from_stretch"))._adjusted(views, pairs)
+        start = replace(self, camera=camera, snapshots=self.snapshots.inside("from_stretch"))
+        other = start._adjusted(views, pairs, ("global",))  # the incremental mapper takes minutes to find the same
         return _better(found, other, views, pairs)
 
     def _by_stretch(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> pycolmap.Camera | None:
@@ -184,9 +185,10 @@ class CandidateModels:
         best = min(tried, key=lambda m: unexplained(m, inside, part.xy) / m.num_reg_images())
         return unknown_camera(width, height, best.cameras[1].mean_focal_length(), is_prior=True)
 
-    def _adjusted(self, views: KeyframeSet, pairs: Sequence[VerifiedPair]) -> AdjustedModel | None:
+    def _adjusted(
+        self, views: KeyframeSet, pairs: Sequence[VerifiedPair], mappers: Sequence[str] = ("global", "incremental")
+    ) -> AdjustedModel | None:
         """Return the best adjusted model, with the readout of a rolling shutter that is given or found."""
-        mappers = ("global", "incremental")
         found = self._map(views, pairs, (*mappers, GIVEN))
         if found is None:
             return None
