@@ -43,6 +43,8 @@ _LEVELS, _GROWTH = 7, 1.5
 _ACROSS, _SLIT, _SAME_SIDE, _OVER = 320, 11, 0.03, 0.75
 """Pixels of a view's longer side that patches are made in, how wide a slit is, the part by which depths differ at most
 that are one patch, and how far patches reach over the rim of what is missing."""
+_VIEWS = 400
+"""About as many are asked for patches; of a longer recording every second or third."""
 
 
 @dataclass(frozen=True)
@@ -398,7 +400,8 @@ def patched(mesh: MeshArrays, views: Sequence[PosedDepth], most: int) -> MeshArr
     """
     vertices, faces, colors, labels = mesh.vertices, mesh.faces, mesh.colors, mesh.labels
     tree = cKDTree(vertices) if len(vertices) else None
-    for view in chain(views, views):
+    some = range(0, len(views), -(-len(views) // _VIEWS) or 1)
+    for view in (views[n] for n in chain(some, some)):
         stride = -(-max(view.depth.shape) // _ACROSS)
         depth, camera = view.depth[stride // 2 :: stride, stride // 2 :: stride], view.intrinsics.every(stride)
         drawn = draw_faces(vertices, faces, view.cam_from_world, camera).depth
