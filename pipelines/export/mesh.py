@@ -29,9 +29,10 @@ from ..system.values import load_value, save_value
 from ..types import VOID
 from .inventory import FoundThings, things_in
 from .light import SHARE, clustered, lightened, smoothed_rims
+from .patches import patched
 from .planes import Planes, planes_of, put_planes, snap_to_planes
 from .scene import ExportScene, write_things
-from .surface import Region, chunk_surfaces, closed, filled, joined, patched, weld
+from .surface import Region, chunk_surfaces, closed, filled, joined, weld
 from .texture import textured
 from .volume import BEHIND, Grid, fuse, make_grid
 

@@ -14,7 +14,8 @@ from scipy.ndimage import binary_fill_holes
 
 from msgs_slam.formats.ply import MeshArrays, read_mesh_ply, write_mesh_ply
 from msgs_slam.pipelines.export.mesh import paint
-from msgs_slam.pipelines.export.surface import Region, Surface, Triangles, chunk_surfaces, closed, joined, patched, weld
+from msgs_slam.pipelines.export.patches import patched
+from msgs_slam.pipelines.export.surface import Region, Surface, Triangles, chunk_surfaces, closed, joined, weld
 from msgs_slam.pipelines.export.volume import CHUNK, Grid, Volume, fuse, make_grid
 from msgs_slam.pipelines.geometry.posed_depth import PosedDepth
 from msgs_slam.pipelines.mapping.measure import MeshView
