@@ -28,15 +28,17 @@ def patched(mesh: MeshArrays, views: Sequence[PosedDepth], most: int) -> MeshArr
     enclosed. Corners between pixels of nearly one depth are common to their squares, and at a step of the depth none:
     nothing reaches from what is near to what is behind it.
     """
+    if not len(mesh.faces):
+        return mesh
     vertices, faces, colors, labels = mesh.vertices, mesh.faces, mesh.colors, mesh.labels
-    tree = cKDTree(vertices) if len(vertices) else None
+    tree = cKDTree(vertices)
     some = range(0, len(views), -(-len(views) // _VIEWS) or 1)
     for view in (views[n] for n in chain(some, some)):
         stride = -(-max(view.depth.shape) // _ACROSS)
         depth, camera = view.depth[stride // 2 :: stride, stride // 2 :: stride], view.intrinsics.every(stride)
         drawn = draw_faces(vertices, faces, view.cam_from_world, camera).depth
         missing = _is_enclosed(drawn > 0) & (depth > 0)
-        if tree is None or not missing.any():
+        if not missing.any():
             continue
         xy, z, corners = _squares(missing, np.where(drawn > 0, drawn, depth).astype(np.float64))
         if len(faces) + len(corners) > most:
