@@ -13,49 +13,62 @@ from ...formats.ply import MeshArrays
 from ..geometry.posed_depth import PosedDepth
 from ..system.raster import draw_faces
 
-_ACROSS, _SLIT, _SAME_SIDE, _OVER = 320, 11, 0.03, 0.75
-"""Pixels of a view's longer side that patches are made in, how wide a slit is, the part by which depths differ at most
-that are one patch, and how far patches reach over the rim of what is missing."""
+_ACROSS, _COARSER = 320, (1, 2, 4)
+"""Pixels of a view's longer side that patches are made in, and how many times coarser ones."""
+_SLIT, _SAME_SIDE, _OVER = 1 / 32, 0.03, 0.75
+"""How wide a slit is in such sides, the part by which depths differ at most that are one patch, and how many pixels
+patches reach over the rim of what is missing."""
 _VIEWS = 400
 """About as many are asked for patches; of a longer recording every second or third."""
 
 
 def patched(mesh: MeshArrays, views: Sequence[PosedDepth], most: int) -> MeshArrays:
     """Cover what views see in slits and holes of the mesh: a square a pixel, at the depth that the view knows there,
-    up to so many faces in all.
+    of coarser pixels where there would be more than `most` faces in all, as many as there may be of the coarsest.
 
     What an earlier view has covered is covered for the later ones; it is looked at again, for what those may have
     enclosed. Corners between pixels of nearly one depth are common to their squares, and at a step of the depth none:
     nothing reaches from what is near to what is behind it.
     """
-    if not len(mesh.faces):
-        return mesh
+    made = mesh
+    for coarser in _COARSER if len(mesh.faces) else ():
+        made, is_whole = _patched(mesh, views, most, coarser)
+        if is_whole:
+            break
+    return made
+
+
+def _patched(mesh: MeshArrays, views: Sequence[PosedDepth], most: int, coarser: int) -> tuple[MeshArrays, bool]:
+    """With pixels so many times coarser; and whether that are all patches."""
     vertices, faces, colors, labels = mesh.vertices, mesh.faces, mesh.colors, mesh.labels
-    tree = cKDTree(vertices)
+    tree, is_whole = cKDTree(vertices), True
     some = range(0, len(views), -(-len(views) // _VIEWS) or 1)
     for view in (views[n] for n in chain(some, some)):
-        stride = -(-max(view.depth.shape) // _ACROSS)
+        stride = coarser * -(-max(view.depth.shape) // _ACROSS)
         depth, camera = view.depth[stride // 2 :: stride, stride // 2 :: stride], view.intrinsics.every(stride)
         drawn = draw_faces(vertices, faces, view.cam_from_world, camera).depth
-        missing = _is_enclosed(drawn > 0) & (depth > 0)
+        missing = _is_enclosed(drawn > 0, 1 + 2 * round(_SLIT * max(depth.shape) / 2)) & (depth > 0)
         if not missing.any():
             continue
         xy, z, corners = _squares(missing, np.where(drawn > 0, drawn, depth).astype(np.float64))
         if len(faces) + len(corners) > most:
-            break
+            is_whole = False
+            if coarser < _COARSER[-1]:
+                break
+            continue
         seen = PosedDepth(camera, view.cam_from_world, depth, depth)
         new, count = seen.in_world(xy, z).astype(np.float32), np.int32(len(vertices))
         nearest = tree.query(new)[1]
         vertices, faces = np.concatenate([vertices, new]), np.concatenate([faces, corners + count])
         colors, labels = (np.concatenate([values, values[nearest]]) for values in (colors, labels))
-    return MeshArrays(vertices, faces, colors, labels)
+    return MeshArrays(vertices, faces, colors, labels), is_whole
 
 
-def _is_enclosed(covered: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(H, W) what is not covered in slits and holes of what is."""
-    ball = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_SLIT, _SLIT))
-    padded = np.pad(covered.astype(np.uint8), _SLIT, mode="edge")
-    near = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, ball)[_SLIT:-_SLIT, _SLIT:-_SLIT] > 0
+def _is_enclosed(covered: NDArray[np.bool_], wide: int) -> NDArray[np.bool_]:
+    """(H, W) what is not covered in slits, up to so many pixels wide, and holes of what is."""
+    ball = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide, wide))
+    padded = np.pad(covered.astype(np.uint8), wide, mode="edge")
+    near = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, ball)[wide:-wide, wide:-wide] > 0
     return np.asarray(binary_fill_holes(near | covered) & ~covered)
 
 

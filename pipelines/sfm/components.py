@@ -43,10 +43,10 @@ LEAP, _AROUND = 3.0, 3
 with a right path the fastest step has at most 2.1, of six that are torn or folded 4 to 60."""
 _LOOP_POINTS = 4 * MIN_POINTS
 """Of a loop between two runs: of false ones one of several things has 24, the right ones have 160 and more."""
-_FLAT, _ON_PLANE = 0.05, 0.9
+_FLAT, _ON_PLANE = 0.05, 0.8
 """How far from a plane points lie on it, over their median distance from the middle of all, and the share of points
 that are one plane. Of loops between rooms of made homes the false ones, a door or a picture that is like another, have
-0.93 to 1, those of several things 0.3 to 0.75."""
+0.82 to 1, those of several things 0.3 to 0.75."""
 _PLANES, _SAMPLED = 200, 2000
 """Planes that are tried, and about how many points they are tried on."""
 _AT_ONCE, _SHARED = 200, 80
