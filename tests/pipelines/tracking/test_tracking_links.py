@@ -228,9 +228,16 @@ def test_segments_are_joined_at_one_scale_wherever_they_recognise_each_other(siz
 
 def test_a_film_does_not_join_rooms_that_only_look_alike() -> None:
     """The far side of the room is taken for the near one: the camera would leap from one keyframe to the next, but
-    where nothing says that these follow on each other."""
-    for near, segments in (([], {0}), ([(3, 5), (15, 18)], {0, 1}), ([(3, 5), (14, 16), (17, 20)], {0})):
-        search = replace(make_walk(twins=True).search(), near=near, times=np.arange(40.0) / 8)
+    where nothing says that these follow on each other, and the film may have a cut."""
+    beside = [(3, 5), (14, 16), (17, 20)]
+    for near, pause, segments in (
+        ([], 0, {0}),
+        ([(3, 5), (15, 18)], 0, {0, 1}),
+        (beside, 0, {0}),
+        (beside, 0.3, {0, 1}),
+    ):
+        times = np.arange(40) / 4 + pause * (np.arange(40) >= 17)
+        search = replace(make_walk(twins=True).search(), near=near, times=times)
         state = search.state
         for k in range(40):
             late = 17 <= k < 25
