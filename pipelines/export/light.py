@@ -48,10 +48,18 @@ def _with_faces(mesh: MeshArrays, rows: NDArray[np.int64], faces: NDArray[np.int
 def lightened(mesh: MeshArrays, most: int) -> tuple[MeshArrays, NDArray[Any]]:
     """At most so many faces, and their labels (F,), whose borders stay where they are."""
     labels, pairs, edges = _labels_of_faces(mesh)
-    middles = mesh.vertices[mesh.faces].mean(axis=1)
     light = simplified(mesh, most, edges[labels[pairs[:, 0]] != labels[pairs[:, 1]]])
-    nearest = cKDTree(middles).query(light.vertices[light.faces].mean(axis=1))[1]
-    return light, labels[nearest]
+    return light, labels_near(mesh, labels, light)
+
+
+def labels_near(mesh: MeshArrays, labels: NDArray[Any], other: MeshArrays) -> NDArray[Any]:
+    """Return the labels of the faces of another mesh: those of the nearest faces of this one, which has labels (F,)."""
+    return np.asarray(labels[cKDTree(middles(mesh)).query(middles(other))[1]])
+
+
+def middles(mesh: MeshArrays) -> NDArray[np.float64]:
+    """Return the middles (F, 3) of the faces."""
+    return mesh.vertices[mesh.faces].mean(axis=1).astype(np.float64)
 
 
 def _labels_of_faces(mesh: MeshArrays) -> tuple[NDArray[Any], NDArray[np.int64], NDArray[np.int64]]:
@@ -108,7 +116,7 @@ def simplified(mesh: MeshArrays, most: int, kept: NDArray[np.int64] | None = Non
         found, made = simplify(points, faces, target_count=max(most, _FEWEST), agg=_SMOOTH)
         found = found.astype(np.float32)
         nearest = tree.query(found)[1]
-        made = made[~are_slivers(found, made) & (nearest[made] < len(mesh.vertices)).all(axis=1)]
+        made = made[~_are_slivers(found, made) & (nearest[made] < len(mesh.vertices)).all(axis=1)]
         if len(made) <= most:
             break
     if not len(made):
@@ -128,7 +136,7 @@ def _above(mesh: MeshArrays, edges: NDArray[np.int64]) -> NDArray[np.float32]:
     return ((first + second) / 2 + high * normals).astype(np.float32)
 
 
-def are_slivers(vertices: NDArray[np.float32], faces: NDArray[np.integer]) -> NDArray[np.bool_]:
+def _are_slivers(vertices: NDArray[np.float32], faces: NDArray[np.integer]) -> NDArray[np.bool_]:
     """Return which triangles (F,) are lines: laid flat, one is drawn out over a whole texture."""
     sides = np.linalg.norm(vertices[faces].astype(np.float64) - vertices[np.roll(faces, 1, axis=1)], axis=2)
     return np.asarray(areas(vertices, faces) <= _LINE * sides.max(axis=1) ** 2)

@@ -28,7 +28,7 @@ from ..system.threads import get_threads, host_threads
 from ..system.values import load_value, save_value
 from ..types import VOID
 from .inventory import FoundThings, things_in
-from .light import SHARE, clustered, lightened, smoothed_rims
+from .light import SHARE, clustered, labels_near, lightened, middles, smoothed_rims
 from .patches import patched
 from .planes import Planes, planes_of, put_planes, snap_to_planes
 from .scene import ExportScene, write_things
@@ -92,8 +92,8 @@ def write_mesh(scene: ExportScene, target: Target) -> None:
     kinds, label_of, thing_of = _kinds(mesh, things)
     of_kinds = replace(mesh, labels=kinds)  # type: ignore[arg-type] # any integers do
     light, of_faces = lightened(filled(smoothed_rims(clustered(of_kinds)), shown), round((1 - _PATCHES) * most))
-    light, middles = patched(light, shown, settings.triangles), _middles(light)
-    of_faces = of_faces[cKDTree(middles).query(_middles(light))[1]]
+    covered = patched(light, shown, settings.triangles)
+    light, of_faces = covered, labels_near(light, of_faces, covered)
     labels = label_of[of_faces]
     if settings.texture:
         made = textured(outcome, light, labels, shown, context.progress)
@@ -128,17 +128,13 @@ def _kinds(mesh: MeshArrays, things: FoundThings) -> tuple[NDArray[np.int64], ND
 
 def _is_hidden(mesh: MeshArrays, views: Iterable[PosedDepth]) -> NDArray[np.bool_]:
     """(F,) whether no view sees a face's middle."""
-    middles, hidden = _middles(mesh), np.ones(len(mesh.faces), bool)
+    places, hidden = middles(mesh), np.ones(len(mesh.faces), bool)
     for view in views:
-        xy, z, inside = view.seen(middles)
+        xy, z, inside = view.seen(places)
         rows = np.flatnonzero(inside & hidden)
         column, row = xy[rows].astype(int).T
         hidden[rows[view.depth[row, column] > (1 - _BEFORE) * z[rows]]] = False
     return hidden
-
-
-def _middles(mesh: MeshArrays) -> NDArray[np.float64]:
-    return mesh.vertices[mesh.faces].mean(axis=1).astype(np.float64)
 
 
 def _scratch(context: StageContext) -> Path:
